@@ -1,4 +1,4 @@
-"""``acquire bench``: the highest line rate that this host captures and records without a loss."""
+"""``acquire bench``: find the highest line rate that this host captures and records without losing lines."""
 
 from __future__ import annotations
 
@@ -39,22 +39,25 @@ def bench(
     settings: Annotated[
         list[str] | None,
         typer.Option(
-            "--set", metavar="KEY=VALUE", help="Change one value of the file, e.g. recording.codec=lz4."
+            "--set",
+            metavar="KEY=VALUE",
+            help="Override one value of the rig file, such as recording.codec=lz4. Repeatable.",
         ),
     ] = None,
     out: Annotated[
-        Path | None, typer.Option(help="Directory to record in; absent: the configuration's.")
+        Path | None, typer.Option(help="Directory to record in. Default: the one in the rig file.")
     ] = None,
     seconds: Annotated[
         float, typer.Option(parser=seconds_between(0.1, 600), metavar="TIME", help="Duration of each run.")
     ] = 2.0,
-    runs: Annotated[int, typer.Option(min=1, max=100, help="Largest number of runs.")] = 9,
+    runs: Annotated[int, typer.Option(min=1, max=100, help="Maximum number of runs.")] = 9,
     json: JsonFlag = False,
 ) -> None:
-    """Search for the highest line rate without a loss.
+    """Find the highest line rate without lost lines.
 
-    Cameras show stored lines, everything else is as in a run. Every run has processes, rings and a
-    recording of its own, which is removed again. Exit code 5 where no rate that is tried can be held.
+    The cameras deliver stored lines; everything else works as in a real run. Every run has its own processes,
+    rings and recording, which is deleted afterwards. The exit code is 5 if lines were lost at every rate
+    tried.
 
     Example: [bold]acquire bench --config rig-vt-4k5c-h100 --out /data[/]
     """
@@ -76,12 +79,14 @@ def bench(
             {
                 "lines": f"2 x {load.pixels} px {load.dtype}, codec {load.codec}",
                 "recorded to": str(directory),
-                "parts allow": limits,
+                "limits": limits,
             }
         )
-    with stage_progress(f"recording at most {runs} times") as advance:
-        told = _Told(advance, runs, aloud=not json)
-        trials = search_rate(load, directory, parts.line_rate_hz, seconds=seconds, tell=told, most_runs=runs)
+    with stage_progress(f"recording up to {runs} times") as advance:
+        reporter = _TrialReporter(advance, runs, aloud=not json)
+        trials = search_rate(
+            load, directory, parts.line_rate_hz, seconds=seconds, tell=reporter, most_runs=runs
+        )
     found = best(trials)
     if json:
         print_json(_facts(load, parts, trials, found))
@@ -93,13 +98,13 @@ def bench(
     if found is None:
         slowest = min(trial.line_rate_hz for trial in trials)
         raise DeviceError(
-            f"this host held none of the line rates that were tried, down to {quantity(slowest, 'Hz')}",
+            f"this host lost lines at every line rate that was tried, down to {quantity(slowest, 'Hz')}",
             hint="another disk (--out), recording.codec, a longer ring (stream.ring_slots), or an idle host",
         )
 
 
-class _Told:
-    """Told of each trial as it ends."""
+class _TrialReporter:
+    """Callback that reports each trial as it ends."""
 
     def __init__(self, advance: Callable[[int, int], None], runs: int, *, aloud: bool) -> None:
         self._advance, self._runs, self._aloud = advance, runs, aloud
@@ -109,7 +114,8 @@ class _Told:
         self._done += 1
         self._advance(self._done, self._runs)
         if self._aloud:
-            say(f"  {quantity(trial.line_rate_hz, 'Hz')}: {'held' if trial.held else 'not held'}", err=True)
+            result = "sustained" if trial.held else "not sustained"
+            say(f"  {quantity(trial.line_rate_hz, 'Hz')}: {result}", err=True)
 
 
 def _row(load: Load, trial: Trial, found: Trial) -> tuple[str, ...]:
@@ -124,11 +130,20 @@ def _row(load: Load, trial: Trial, found: Trial) -> tuple[str, ...]:
         f"{100 * report.ring_peak:.0f} %",
         f"{sum(report.cores.values()):.2f}",
         f"{report.latency_ms['p99.9']:.1f} ms",
-        "highest without loss" if trial is found else ("held" if trial.held else "not held"),
+        "highest without loss" if trial is found else ("sustained" if trial.held else "not sustained"),
     )
 
 
 def _facts(load: Load, parts: Parts, trials: list[Trial], found: Trial | None) -> dict[str, Any]:
+    measured = []
+    for trial in trials:
+        facts: dict[str, Any] = {"line_rate_hz": trial.line_rate_hz, "held": trial.held}
+        if trial.report is None:
+            facts["trouble"] = trial.trouble
+        else:
+            names = ("lines", "lost", "unaccounted", "ring_peak", "cores", "latency_ms")
+            facts |= {name: getattr(trial.report, name) for name in names}
+        measured.append(facts)
     return {
         "pixels": load.pixels,
         "dtype": load.dtype,
@@ -137,20 +152,5 @@ def _facts(load: Load, parts: Parts, trials: list[Trial], found: Trial | None) -
         "limits_hz": parts.limits,
         "highest_hz": None if found is None else found.line_rate_hz,
         "highest_bytes_per_s": None if found is None else found.line_rate_hz * load.line_bytes,
-        "trials": [_trial_facts(trial) for trial in trials],
-    }
-
-
-def _trial_facts(trial: Trial) -> dict[str, Any]:
-    facts: dict[str, Any] = {"line_rate_hz": trial.line_rate_hz, "held": trial.held}
-    if trial.report is None:
-        return facts | {"trouble": trial.trouble}
-    report = trial.report
-    return facts | {
-        "lines": report.lines,
-        "lost": report.lost,
-        "unaccounted": report.unaccounted,
-        "ring_peak": report.ring_peak,
-        "cores": report.cores,
-        "latency_ms": report.latency_ms,
+        "trials": measured,
     }

@@ -1,4 +1,4 @@
-"""``acquire calibrate``: what the instrument is, measured from recordings of known light, step by step."""
+"""``acquire calibrate``: measure the instrument from recordings of known light, step by step."""
 
 from __future__ import annotations
 
@@ -25,18 +25,23 @@ RecordingArgument = Annotated[
     typer.Argument(
         metavar="RECORDING",
         autocompletion=recordings,
-        help="A directory NAME.zarr, or its URL: s3://bucket/NAME.zarr.",
+        help="Recording: a directory NAME.zarr, or its URL, such as s3://bucket/NAME.zarr.",
     ),
 ]
 OutOption = Annotated[
     str,
-    typer.Option("--out", metavar="CAL", help="The calibration: a new NAME.zarr, or one that is added to."),
+    typer.Option(
+        "--out",
+        metavar="CAL",
+        help="Calibration to write, NAME.zarr. An existing one is extended with this step.",
+    ),
 ]
 CoveredOption = Annotated[
-    bool, typer.Option("--covered", help="The lens is covered: the code does not matter.")
+    bool,
+    typer.Option("--covered", help="The lens was covered during the recording, so that any code will do."),
 ]
 CHANGED = 1
-"""Exit code of a check that finds the calibration no longer true."""
+"""Exit code of a check that finds the calibration out of date."""
 
 
 def register(app: typer.Typer) -> None:
@@ -62,11 +67,11 @@ def dark(
     end: ToOption = None,
     json: JsonFlag = False,
 ) -> None:
-    """Offset and noise of every column, from lines without the light.
+    """Measure the offset and noise of every column, from lines recorded without the light.
 
-    Record with the lens as in use and the light's code 0 (code.kind = "constant", code.value = 0): the offset
-    then holds the ambient light, too. Or cover the lens and say --covered. 1024 lines give offsets to 0.1 DN;
-    the black level must be some noises above 0.
+    Record with the lens as in use and the light's code 0 (code.kind = "constant", code.value = 0); the offset
+    then includes the ambient light. Or cover the lens and give --covered. 1024 lines give offsets to 0.1 DN.
+    The black level must be above 0 by a few times the noise.
 
     Example: [bold]acquire calibrate dark dark.zarr --out cal.zarr[/]
     """
@@ -87,9 +92,10 @@ def ambient(
     end: ToOption = None,
     json: JsonFlag = False,
 ) -> None:
-    """Light that no code switches, from lines with the lens open and the light's code 0.
+    """Measure the ambient light, from lines recorded with the lens open and the light's code 0.
 
-    Only after a dark that was --covered: other darks hold the ambient light already. 1024 lines are enough.
+    This step needs a dark that was recorded with --covered, since other darks already include the ambient
+    light. 1024 lines are enough.
 
     Example: [bold]acquire calibrate ambient open.zarr --out cal.zarr[/]
     """
@@ -108,7 +114,7 @@ def flat(
         bool,
         typer.Option(
             "--smooth",
-            help="The scene is not quite uniform: what varies smoothly along the columns is the scene's.",
+            help="The scene is not quite uniform: attribute smooth variation along the columns to the scene.",
         ),
     ] = False,
     first_line: FirstLineOption = None,
@@ -117,10 +123,10 @@ def flat(
     end: ToOption = None,
     json: JsonFlag = False,
 ) -> None:
-    """Gain of every column and the arms' balance, from a white scene under steady light.
+    """Measure the gain of every column and the balance of the arms, from a white scene in steady light.
 
-    Put a uniform white scene in, larger than the field, and record with the light's code 1 at 50 to 70 % of
-    white. 1024 lines give gains to 0.05 %. Needs the dark step.
+    Put in a uniform white scene that is larger than the field, and record with the light's code 1 at 50 to
+    70 % of white. 1024 lines give gains to 0.05 %. The dark step must come first.
 
     Example: [bold]acquire calibrate flat flat.zarr --out cal.zarr[/]
     """
@@ -134,15 +140,16 @@ def flat(
 
 def transfer(
     recordings: Annotated[
-        list[str], typer.Argument(metavar="RECORDING...", help="Flats, at one level of light or several.")
+        list[str],
+        typer.Argument(metavar="RECORDING...", help="Recordings of flats, at one or several light levels."),
     ],
     out: OutOption,
     json: JsonFlag = False,
 ) -> None:
-    """DN per electron and read noise, and the full well where the light reaches it: EMVA 1288's transfer.
+    """Measure DN per electron, read noise and full well by the photon transfer method of EMVA 1288.
 
-    Record flats as for the flat step; several, from dim to saturated, show the full well. 1024 lines give the
-    DN per electron to 1 %, 4096 to 0.3 %. Needs the dark step.
+    Record flats as for the flat step. The full well needs several of them, from dim to saturated. 1024 lines
+    give the DN per electron to 1 %, 4096 lines to 0.3 %. The dark step must come first.
 
     Example: [bold]acquire calibrate transfer flat-10.zarr flat-50.zarr flat-90.zarr --out cal.zarr[/]
     """
@@ -164,10 +171,10 @@ def orientation(
     end: ToOption = None,
     json: JsonFlag = False,
 ) -> None:
-    """Which of eight views of the scene arm B has: turned how, mirrored or not, arms swapped or not.
+    """Find out how arm B's view is rotated or mirrored against arm A's, and whether the arms are swapped.
 
-    Put in a target at rest with sharp, irregular texture and record with the usual pseudo-random code.
-    1024 lines tell. "Cannot tell" is among the answers.
+    Put in a stationary target with sharp, irregular texture and record with the usual pseudo-random code.
+    1024 lines are enough. If the lines do not decide between the eight views, the command says so.
 
     Example: [bold]acquire calibrate orientation target.zarr --out cal.zarr[/]
     """
@@ -188,18 +195,18 @@ def align(
     end: ToOption = None,
     json: JsonFlag = False,
 ) -> None:
-    """Where arm B's image lies on arm A's: shift, turn and magnification.
+    """Measure how arm B's image lies on arm A's: shift, rotation and magnification.
 
-    Put in a target at rest with sharp texture all over the field, dots or bars of 2 to 6 fine pixels, and
-    record with the usual pseudo-random code. 1024 lines give 0.02 fine pixels; 263 are too few. Best after
-    dark and flat. Behind a fibre each tile is aligned by itself, as its bands lie.
+    Put in a stationary target with sharp texture all over the field, dots or bars of 2 to 6 fine pixels, and
+    record with the usual pseudo-random code. 1024 lines give 0.02 fine pixels; 263 are too few. It is best
+    done after dark and flat. Behind a fibre each tile is aligned separately, along its fibre bands.
 
     Example: [bold]acquire calibrate align target.zarr --out cal.zarr[/]
     """
     from acquire.calibrate import target
 
     known, exposure = _known_or_new(out, recording), _exposure(recording, first_line, lines, begin, end)
-    with stage_progress("laying the arms' images on each other"):
+    with stage_progress("aligning the arms' images"):
         behind = exposure.recording.fibre is not None
         found = (target.tile_alignments if behind else target.alignment)(exposure, known)
     _keep(out, found, json=json, new=True)
@@ -214,38 +221,51 @@ def psf(
     end: ToOption = None,
     json: JsonFlag = False,
 ) -> None:
-    """How wide the optics blur each arm's image, from straight sharp edges; where it is wanted.
+    """Measure the width of each arm's optical blur from straight, sharp edges. This step is optional.
 
-    Put in a square or a checkerboard, turned by 3 to 20 degrees, its edges 30 fine pixels or more from one
-    another, at rest and in focus, and record with the usual pseudo-random code. 1024 lines give 0.05 fine
-    pixels. "Cannot tell" is among the answers. A reconstruction then sharpens by as much.
+    Put in a square or a checkerboard, rotated by 3 to 20 degrees, with edges at least 30 fine pixels apart,
+    stationary and in focus, and record with the usual pseudo-random code. 1024 lines give 0.05 fine pixels.
+    If the lines do not determine the blur, the command says so. Reconstructions then correct the blur.
 
     Example: [bold]acquire calibrate psf edges.zarr --out cal.zarr[/]
     """
     from acquire.calibrate import psf as method
 
     known, exposure = _known_or_new(out, recording), _exposure(recording, first_line, lines, begin, end)
-    with stage_progress("looking at edges"):
+    with stage_progress("measuring the edges"):
         found = method.psf(exposure, known)
     _keep(out, found, json=json, new=True)
 
 
 def show(
     calibration: Annotated[
-        str, typer.Argument(metavar="CAL", help="A calibration, or a recording that carries one.")
+        str, typer.Argument(metavar="CAL", help="Calibration, or a recording that carries one.")
     ],
     out: Annotated[
-        Path | None, typer.Option(metavar="DIR", help="New directory for a page with plots.")
+        Path | None,
+        typer.Option(metavar="DIR", help="Also write a page with plots into this new directory."),
     ] = None,
     json: JsonFlag = False,
 ) -> None:
-    """What a calibration holds, how sure it is, and how it was found; as a page with plots, too.
+    """Show the contents of a calibration, their uncertainties, and how they were measured.
 
     Example: [bold]acquire calibrate show cal.zarr --out cal-page[/]
     """
+    from acquire.calibrate import calibration_of
     from acquire.calibrate.words import known_facts
+    from acquire.store import open_recording
+    from acquire.store.layout import READABLE
+    from acquire.store.opening import format_of
 
-    known = _any(calibration)
+    if format_of(calibration) in READABLE:  # a recording: show the copy that it carries
+        carried = calibration_of(open_recording(calibration))
+        if carried is None:
+            raise PlaceError(
+                f"{calibration} carries no calibration", possible="a calibration, or a recording with one"
+            )
+        known = carried
+    else:
+        known = _known(calibration)
     if json:
         print_json(known.to_attrs())
     else:
@@ -261,7 +281,7 @@ def show(
 
 
 def check(
-    calibration: Annotated[str, typer.Argument(metavar="CAL", help="A calibration: NAME.zarr.")],
+    calibration: Annotated[str, typer.Argument(metavar="CAL", help="Calibration NAME.zarr.")],
     recording: RecordingArgument,
     covered: CoveredOption = False,
     first_line: FirstLineOption = None,
@@ -270,9 +290,9 @@ def check(
     end: ToOption = None,
     json: JsonFlag = False,
 ) -> None:
-    """Is a calibration still true? A new recording of dark lines, a flat or a target is compared with it.
+    """Check whether a calibration is still valid, using a new recording of dark lines, a flat or a target.
 
-    Ends with 1 where something has changed by more than a reconstruction can take.
+    The exit code is 1 if something has changed by more than reconstructions tolerate.
 
     Example: [bold]acquire calibrate check cal.zarr target-today.zarr[/]
     """
@@ -288,7 +308,7 @@ def check(
     else:
         if rows:
             print_table(
-                ("quantity", "changed by", "unit", "sure to", "so"), [tuple(r.values()) for r in rows]
+                ("quantity", "change", "unit", "uncertainty", "verdict"), [tuple(r.values()) for r in rows]
             )
         else:
             say("nothing could be compared")
@@ -316,53 +336,38 @@ def _known(place: str) -> Calibration:
 
 
 def _known_or_new(place: str, recording: str) -> Calibration:
-    """The calibration at a place, or an empty one of the recording's instrument."""
+    """Return the calibration at a place, or an empty one for the recording's instrument."""
     from acquire.calibrate import Calibration
     from acquire.calibrate.exposure import instrument_of
     from acquire.store import open_recording
 
-    if _there(place):
+    if _exists(place):
         return _known(place)
     return Calibration(instrument_of(open_recording(recording)))
 
 
-def _any(place: str) -> Calibration:
-    """A calibration, or the copy that a recording carries."""
-    from acquire.calibrate import calibration_of
-    from acquire.store import open_recording
-    from acquire.store.layout import READABLE
-    from acquire.store.opening import format_of
-
-    if format_of(place) not in READABLE:
-        return _known(place)
-    found = calibration_of(open_recording(place))
-    if found is None:
-        raise PlaceError(f"{place} carries no calibration", possible="a calibration, or a recording with one")
-    return found
-
-
-def _there(place: str) -> bool:
+def _exists(place: str) -> bool:
     from acquire.store.source import source_of
 
     return source_of(place).exists()
 
 
 def _keep(place: str, found: Finding, *, json: bool, new: bool = False) -> None:
-    """Add what was found to the calibration at a place, and say it."""
+    """Add a finding to the calibration at a place, and print it."""
     from acquire.calibrate import Calibration, save_calibration
 
-    known = Calibration(found.instrument) if new and not _there(place) else _known(place)
+    known = Calibration(found.instrument) if new and not _exists(place) else _known(place)
     if found.step == "orientation" and found.orientation is None:
-        _tell(found, None, json=json)
+        _print_finding(found, None, json=json)
         raise UsageError(
-            f"the orientation cannot be told from {found.facts['recording']}",
-            hint="a target with sharp, irregular texture, at rest; more lines",
+            f"the orientation cannot be determined from {found.facts['recording']}",
+            hint="a stationary target with sharp, irregular texture, or more lines",
         )
     save_calibration(place, known.with_step(found))
-    _tell(found, place, json=json)
+    _print_finding(found, place, json=json)
 
 
-def _tell(found: Finding, place: str | None, *, json: bool) -> None:
+def _print_finding(found: Finding, place: str | None, *, json: bool) -> None:
     from acquire.calibrate.words import found_facts
 
     facts = found_facts(found)
@@ -371,6 +376,6 @@ def _tell(found: Finding, place: str | None, *, json: bool) -> None:
         return
     print_facts(facts)
     if place is not None:
-        print_facts({"kept in": place})
+        print_facts({"saved in": place})
     for text in found.warnings:
         print_warning(text)

@@ -1,4 +1,4 @@
-"""``acquire calibrate all``: the guided sequence on a running daemon."""
+"""``acquire calibrate all``: the guided sequence of all calibration steps, on a running daemon."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from acquire.calibrate.guide import AT_ONCE, LINES, MOST_LINES, OPTIONAL, PSF, Step
-from acquire.cli.calibrate_live import instrument, kept, record, tell_finding, wait_for_enter
+from acquire.cli.calibrate_live import instrument, print_finding, record, save_finding, wait_for_enter
 from acquire.cli.control import SocketOption
 from acquire.cli.output import JsonFlag, note, print_json, print_warning, say
 from acquire.errors import UsageError
@@ -18,18 +18,22 @@ if TYPE_CHECKING:
 
     from acquire.calibrate.calibration import Calibration, Finding
     from acquire.calibrate.exposure import Exposure
-    from acquire.client import Client, Setup
+    from acquire.client import Client
 
 TRIES = 3
-"""Of a step, where somebody can mend what was wrong."""
+"""Attempts at a step if somebody is there to correct the cause of a failure."""
 
 
 def calibrate_all(
     out: Annotated[
-        str, typer.Option("--out", metavar="CAL", help="The calibration: new, or one that is added to.")
+        str,
+        typer.Option(
+            "--out", metavar="CAL", help="Calibration to write, NAME.zarr. An existing one is extended."
+        ),
     ],
     directory: Annotated[
-        Path, typer.Option(metavar="DIR", help="Directory of the recordings, which stay; made if absent.")
+        Path,
+        typer.Option(metavar="DIR", help="Directory for the recordings, which are kept. Created if needed."),
     ] = Path("calibration-recordings"),
     lines: Annotated[
         int, typer.Option(min=64, max=MOST_LINES, help="Number of lines of each recording.")
@@ -37,63 +41,63 @@ def calibrate_all(
     only: Annotated[
         list[str] | None,
         typer.Option(
-            metavar="STEP", help="Only this step: dark, flat, target or psf; repeatable; absent: all but psf."
+            metavar="STEP",
+            help="Do only this step: dark, flat, target or psf. Repeatable. Default: all steps except psf.",
         ),
     ] = None,
     psf: Annotated[
-        bool, typer.Option("--psf", help="In the end the optics' blur, too, from edges that are put in.")
+        bool,
+        typer.Option("--psf", help="Also measure the optical blur at the end, from a target with edges."),
     ] = False,
     yes: Annotated[
-        bool, typer.Option("--yes", help="Ask nothing: everything is in place already, or moves by itself.")
+        bool,
+        typer.Option("--yes", help="Do not wait for Enter: every target is in place or moved automatically."),
     ] = False,
     socket: SocketOption = None,
     json: JsonFlag = False,
 ) -> None:
-    """Calibrate the instrument that the daemon runs: dark, flat, target in turn, psf where wanted.
+    """Calibrate the instrument run by the daemon: dark, flat and target in turn, and psf if requested.
 
-    Says before each recording what to do, and waits for Enter. What was found is kept step by step; begun
-    again with --only, it goes on where it ended. The instrument is left as it was: armed or not.
+    The command gives instructions before each recording and waits for Enter. Results are saved after every
+    step, so that --only can continue an interrupted calibration. Afterwards the instrument is armed or idle
+    as it was before.
 
     Example: [bold]acquire calibrate all --out cal.zarr[/]
     """
     names = [step.name for step in (*AT_ONCE, *OPTIONAL)]
     if wrong := [each for each in only or () if each not in names]:
-        raise UsageError(f"step {wrong[0]!r} is not known", possible=", ".join(names))
+        raise UsageError(f"there is no step {wrong[0]!r}", possible=", ".join(names))
     steps = [step for step in AT_ONCE if not only or step.name in only]
     if psf or PSF.name in (only or ()):
         steps.append(PSF)
     found: list[Finding] = []
     with instrument(socket, directory) as daemon:
-        if PSF in steps:
-            _refuse_edges_unseen(daemon.setup())
+        if PSF in steps:  # refuse before the first recording if the rig cannot measure the blur
+            config = daemon.setup().config
+            if config["cameras"]["layout"] == "fibre":
+                raise UsageError(
+                    "psf: the rig has a fibre, and edges cannot be followed from one fibre band to the next",
+                    possible="a rig without a fibre",
+                    hint="leave psf out",
+                )
+            if config["code"]["kind"] == "constant":
+                raise UsageError(
+                    "psf: the rig's code is constant, so that the rows of a scene cannot be separated",
+                    possible="a pseudo-random code: code.kind = 'prbs'",
+                    hint="leave psf out, or use a pseudo-random code in the rig file",
+                )
         for step in steps:
             found += _step(daemon, step, out, directory, lines, ask=not yes, quiet=json)
     if json:
         print_json({"calibration": out, "steps": {each.step: each.facts for each in found}})
     else:
-        say(f"kept in  {out}; acquire calibrate show {out} --out DIR draws it")
-
-
-def _refuse_edges_unseen(setup: Setup) -> None:
-    """UsageError, before the first recording, on a rig whose lines cannot tell how wide the optics blur."""
-    if setup.config["cameras"]["layout"] == "fibre":
-        raise UsageError(
-            "psf: the rig has a fibre, and edges are not followed from band to band",
-            possible="a rig without a fibre",
-            hint="leave psf out",
-        )
-    if setup.config["code"]["kind"] == "constant":
-        raise UsageError(
-            "psf: the rig's code is constant, which does not tell the rows of a scene apart",
-            possible="a pseudo-random code: code.kind = 'prbs'",
-            hint="leave psf out, or give the rig such a code",
-        )
+        say(f"saved in  {out}; to plot it: acquire calibrate show {out} --out DIR")
 
 
 def _step(
     daemon: Client, step: Step, out: str, directory: Path, lines: int, *, ask: bool, quiet: bool
 ) -> list[Finding]:
-    """Record, look, keep; again where it failed and somebody is there."""
+    """Record, evaluate and save one step; repeat it after a failure if somebody is there (``ask``)."""
     for left in reversed(range(TRIES)):
         note(f"{step.name}: {step.prepare} {lines} lines.")
         if ask:
@@ -101,27 +105,31 @@ def _step(
         try:
             exposure = record(daemon, step.name, directory, lines, code=step.code)
             found = []
-            for look in _looks(step, exposure, out):
-                found.append(kept(out, exposure, look))
+            for evaluate in _evaluations(step, exposure, out):
+                found.append(save_finding(out, exposure, evaluate))
                 if not quiet:
-                    tell_finding(found[-1])
+                    print_finding(found[-1])
                     say()
         except UsageError as error:
             if not (ask and left):
                 raise
             print_warning(f"{step.name}: {error}")
-            note("again:")
+            note("repeating this step:")
             continue
         return found
-    raise AssertionError  # the last try returns or raises
+    raise AssertionError  # the last attempt returns or raises
 
 
-def _looks(step: Step, exposure: Exposure, out: str) -> Iterator[Callable[[Calibration], Finding]]:
-    """What is to be found in a step's recording, given what is known; a ramp told more than a flat does."""
+def _evaluations(step: Step, exposure: Exposure, out: str) -> Iterator[Callable[[Calibration], Finding]]:
+    """Yield the evaluations of a step's recording, each a function of the calibration so far.
+
+    The transfer is left out if a ramp was recorded (step linearity), which determines it better than one
+    flat.
+    """
     from acquire.calibrate import columns, open_calibration, psf, target
     from acquire.calibrate.transfer import transfer
 
-    looks: dict[str, Callable[[Calibration], Finding]] = {
+    evaluations: dict[str, Callable[[Calibration], Finding]] = {
         "dark": lambda _: columns.dark(exposure),
         "flat": lambda known: columns.flat(exposure, known),
         "transfer": lambda known: transfer([exposure], known),
@@ -131,4 +139,4 @@ def _looks(step: Step, exposure: Exposure, out: str) -> Iterator[Callable[[Calib
     }
     for name in step.finds:
         if name != "transfer" or "linearity" not in open_calibration(out).steps:
-            yield looks[name]
+            yield evaluations[name]

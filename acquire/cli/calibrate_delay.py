@@ -1,4 +1,4 @@
-"""``acquire calibrate delay``: light against line start and sub-step, swept by the trigger."""
+"""``acquire calibrate delay``: measure the delay of the light against the lines, by sweeping the trigger."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from acquire.calibrate.guide import DELAY, MOST_LINES
-from acquire.cli.calibrate_live import instrument, kept, record, tell_finding, wait_for_enter
+from acquire.cli.calibrate_live import instrument, print_finding, record, save_finding, wait_for_enter
 from acquire.cli.control import SocketOption
 from acquire.cli.output import JsonFlag, note, print_json
 from acquire.errors import UsageError
@@ -20,34 +20,42 @@ if TYPE_CHECKING:
 
 def delay(
     out: Annotated[
-        str, typer.Option("--out", metavar="CAL", help="The calibration: new, or one that is added to.")
+        str,
+        typer.Option(
+            "--out", metavar="CAL", help="Calibration to write, NAME.zarr. An existing one is extended."
+        ),
     ],
     recordings: Annotated[
         list[str] | None,
         typer.Argument(
-            metavar="RECORDING...", help="Recordings of a sweep, to be looked at again; absent: a new sweep."
+            metavar="RECORDING...",
+            help="Evaluate these recordings of an earlier sweep. Default: record a new sweep.",
         ),
     ] = None,
     directory: Annotated[
-        Path, typer.Option(metavar="DIR", help="Directory of the recordings, which stay; made if absent.")
+        Path,
+        typer.Option(metavar="DIR", help="Directory for the recordings, which are kept. Created if needed."),
     ] = Path("calibration-recordings"),
     lines: Annotated[
         int | None,
         typer.Option(
             min=DELAY.least_lines,
             max=MOST_LINES,
-            help="Number of lines of each recording; absent: as many as half a tick takes.",
+            help="Number of lines per recording. Default: enough for an uncertainty of half a tick.",
         ),
     ] = None,
-    yes: Annotated[bool, typer.Option("--yes", help="Ask nothing: everything is in place already.")] = False,
+    yes: Annotated[
+        bool, typer.Option("--yes", help="Do not wait for Enter: the scene is in place already.")
+    ] = False,
     socket: SocketOption = None,
     json: JsonFlag = False,
 ) -> None:
-    """How late the light is for either camera, to a tick of the trigger, and what to put into the rig file.
+    """Measure the delay of the light for each camera, to one tick of the trigger.
 
-    Sweeps the trigger's delays on the running daemon: one recording that shows where light and charge are,
-    and six around it. At Ctrl-C it ends with what it has. The instrument is left as it was: armed or not.
-    Noise is what limits it: bright light, just below saturation, is best.
+    The result includes the keys for the rig file. The command sweeps the trigger's delays on the running
+    daemon: a first recording locates light and charge, six more follow around it. Ctrl-C ends the sweep early
+    and evaluates what there is. Afterwards the instrument is armed or idle as it was before. Noise limits the
+    result, so bright light just below saturation is best.
 
     Example: [bold]acquire calibrate delay --out cal.zarr[/]
     """
@@ -64,24 +72,24 @@ def delay(
         ticks = {"light_late_ticks": late.value.tolist(), "uncertainty_ticks": late.uncertainty.tolist()}
         print_json(facts | ticks)
         return
-    tell_finding(found, {"kept in": out})
+    print_finding(found, {"saved in": out})
 
 
 def _swept(
     directory: Path, lines: int | None, socket: Path | None, *, ask: bool
 ) -> tuple[list[Exposure], bool]:
-    """One recording to see where to look, and one for each setting around that, until Ctrl-C; whether it is
-    the whole sweep.
-    """
+    """Record the sweep until Ctrl-C; return its exposures, and whether the sweep is complete."""
     from acquire.calibrate import delay_sweep as sweep
-    from acquire.cli.interrupts import first_interrupt_asks
+    from acquire.cli.interrupts import stop_on_interrupt
     from acquire.cli.progress import Progress
     from acquire.daemon.messages import TriggerDelays
 
     note(f"delay: {DELAY.prepare}")
     if ask:
         wait_for_enter()
-    with instrument(socket, directory) as daemon, first_interrupt_asks("ending with what there is") as asked:
+    finishing = "ending with the recordings made so far"
+    with instrument(socket, directory) as daemon, stop_on_interrupt(finishing) as stop_requested:
+        # the first recording gives the rough delay, around which the sweep is laid
         first = record(daemon, "delay", directory, sweep.FIRST_LINES)
         setting, point = sweep.setting_of(first), sweep.point_of(first)
         late = sweep.first_sight(point, setting.substep_ticks)
@@ -93,7 +101,7 @@ def _swept(
         with Progress("sweeping the delays") as progress:
             for done, each in enumerate(settings):
                 progress.advance(done, len(settings))
-                if asked.is_set():
+                if stop_requested.is_set():
                     break
                 delays = TriggerDelays(light_lead=each.light_lead_ticks, a=each.a_ticks, b=each.b_ticks)
                 exposures.append(record(daemon, "delay", directory, lines, delays=delays))
@@ -101,28 +109,21 @@ def _swept(
 
 
 def _found(out: str, exposures: list[Exposure], *, whole: bool) -> Finding:
-    """A part of a sweep does not take the place of what is known better."""
-    from acquire.calibrate.delay_sweep import delay as look
-    from acquire.cli.progress import stage_progress
-
-    with stage_progress("looking beyond the lines' sub-steps") as advance:
-        found = look(exposures, progress=advance)
-    if not whole and (known := _known_ticks(out)) is not None:
-        doubt = float(found.quantities["light_late_ticks"].uncertainty.max())
-        if known < doubt:
-            raise UsageError(
-                f"this part of a sweep is sure to {doubt:.1f} ticks only, and {out} knows it to {known:.1f}",
-                hint="the whole sweep; what was known stays",
-            )
-    return kept(out, exposures[0], lambda _: found)
-
-
-def _known_ticks(out: str) -> float | None:
-    """How surely the calibration at a place knows the delays already; None where it does not."""
+    """Evaluate and save a sweep. An incomplete one does not replace a result with a smaller uncertainty."""
     from acquire.calibrate import open_calibration
+    from acquire.calibrate.delay_sweep import delay as evaluate
+    from acquire.cli.progress import stage_progress
     from acquire.store.source import source_of
 
-    if not source_of(out).exists():
-        return None
-    late = open_calibration(out).quantities.get("light_late_ticks")
-    return None if late is None else float(late.uncertainty.max())
+    with stage_progress("evaluating the sweep") as advance:
+        found = evaluate(exposures, progress=advance)
+    if not whole and source_of(out).exists():
+        known = open_calibration(out).quantities.get("light_late_ticks")
+        ticks = float(found.quantities["light_late_ticks"].uncertainty.max())
+        if known is not None and known.uncertainty.max() < ticks:
+            raise UsageError(
+                f"this part of a sweep has an uncertainty of {ticks:.1f} ticks, more than the "
+                f"{known.uncertainty.max():.2g} in {out}",
+                hint="the whole sweep; the earlier result is kept",
+            )
+    return save_finding(out, exposures[0], lambda _: found)

@@ -1,4 +1,4 @@
-"""``acquire calibrate linearity``: a ramp of light out of the trigger's clock, on the running daemon."""
+"""``acquire calibrate linearity``: a light ramp timed by the trigger's clock, on the running daemon."""
 
 from __future__ import annotations
 
@@ -8,67 +8,83 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from acquire.calibrate.guide import LINEARITY, MOST_LINES, RAMP_LINES
-from acquire.cli.calibrate_live import instrument, kept, record, tell_finding, wait_for_enter
+from acquire.cli.calibrate_live import instrument, print_finding, record, save_finding, wait_for_enter
 from acquire.cli.control import SocketOption
 from acquire.cli.output import JsonFlag, note, print_json, say
 
 if TYPE_CHECKING:
-    from acquire.calibrate.calibration import Finding
     from acquire.calibrate.exposure import Exposure
 
 
 def linearity(
     out: Annotated[
         str,
-        typer.Option("--out", metavar="CAL", help="The calibration: one that has a dark, which is added to."),
+        typer.Option("--out", metavar="CAL", help="Calibration to extend, NAME.zarr. It must have a dark."),
     ],
     recordings: Annotated[
         list[str] | None,
         typer.Argument(
-            metavar="RECORDING...", help="Recordings of a ramp, to be looked at again; absent: a new ramp."
+            metavar="RECORDING...",
+            help="Evaluate these recordings of an earlier ramp. Default: record a new ramp.",
         ),
     ] = None,
     directory: Annotated[
-        Path, typer.Option(metavar="DIR", help="Directory of the recordings, which stay; made if absent.")
+        Path,
+        typer.Option(metavar="DIR", help="Directory for the recordings, which are kept. Created if needed."),
     ] = Path("calibration-recordings"),
     lines: Annotated[
         int, typer.Option(min=64, max=MOST_LINES, help="Number of lines of each recording.")
     ] = RAMP_LINES,
-    yes: Annotated[bool, typer.Option("--yes", help="Ask nothing: everything is in place already.")] = False,
+    yes: Annotated[
+        bool, typer.Option("--yes", help="Do not wait for Enter: the scene is in place already.")
+    ] = False,
     socket: SocketOption = None,
     json: JsonFlag = False,
 ) -> None:
-    """EMVA 1288's linearity error of both cameras, and the curve of one that bends.
+    """Measure the linearity error of both cameras as in EMVA 1288, and the curve of a nonlinear one.
 
-    Records a ramp on the running daemon: the light is on for 1/16 to 15/16 of every sub-step, in ticks of the
-    trigger, so that the ratios are exact whatever the lamp. The ramp tells DN per electron, read noise and
-    full well, too. Reconstructions correct the curve. Needs the dark step, and comes before the flat. At
-    Ctrl-C it ends with what it has. The instrument is left as it was: armed or not.
+    The command records a ramp on the running daemon: the light is on for 1/16 to 15/16 of every sub-step, in
+    ticks of the trigger, so that the ratios are exact whatever the lamp. The ramp also gives DN per electron,
+    read noise and full well. Reconstructions correct the curve. The dark step must come first, and the flat
+    comes afterwards. Ctrl-C ends the ramp early and evaluates what there is. Afterwards the instrument is
+    armed or idle as it was before.
 
     Example: [bold]acquire calibrate linearity --out cal.zarr[/]
     """
     from acquire.calibrate.exposure import open_exposure
+    from acquire.calibrate.linearity import linearity as evaluate
+    from acquire.calibrate.transfer import transfer
+    from acquire.cli.progress import stage_progress
 
     if recordings:
         exposures = [open_exposure(each) for each in recordings]
     else:
         exposures = _ramp(out, directory, lines, socket, ask=not yes)
-    found = _found(out, exposures)
+    with stage_progress("evaluating the ramp") as advance:
+        curve = save_finding(out, exposures[0], lambda known: evaluate(exposures, known, progress=advance))
+    gain = save_finding(out, exposures[0], lambda known: transfer(exposures, known))
     if json:
-        print_json({"calibration": out, "steps": {each.step: _numbers(each) for each in found}})
+        steps = {}
+        for found in (curve, gain):
+            values = {
+                name: {"value": each.value.tolist(), "uncertainty": each.uncertainty.tolist()}
+                for name, each in found.quantities.items()
+            }
+            steps[found.step] = {"facts": found.facts, "warnings": found.warnings, **values}
+        print_json({"calibration": out, "steps": steps})
         return
-    for each in found:
-        tell_finding(each)
+    for found in (curve, gain):
+        print_finding(found)
         say()
-    say(f"kept in  {out}")
+    say(f"saved in  {out}")
 
 
 def _ramp(out: str, directory: Path, lines: int, socket: Path | None, *, ask: bool) -> list[Exposure]:
-    """Steady light, a sixteenth of it, and the levels between, until Ctrl-C."""
+    """Record steady light, a sixteenth of it, and the levels between, until Ctrl-C."""
     from acquire.calibrate import open_calibration
     from acquire.calibrate.checks import offset_of
     from acquire.calibrate.linearity import PARTS, level_ticks, lit_ticks
-    from acquire.cli.interrupts import first_interrupt_asks
+    from acquire.cli.interrupts import stop_on_interrupt
     from acquire.cli.progress import Progress
     from acquire.daemon.messages import TriggerWindow
 
@@ -77,7 +93,8 @@ def _ramp(out: str, directory: Path, lines: int, socket: Path | None, *, ask: bo
     if ask:
         wait_for_enter()
 
-    with instrument(socket, directory) as daemon, first_interrupt_asks("ending with what there is") as asked:
+    finishing = "ending with the recordings made so far"
+    with instrument(socket, directory) as daemon, stop_on_interrupt(finishing) as stop_requested:
         whole = record(daemon, "ramp", directory, lines, code="steady")
         ticks = lit_ticks(whole)[1]
 
@@ -95,25 +112,7 @@ def _ramp(out: str, directory: Path, lines: int, socket: Path | None, *, ask: bo
         with Progress("recording the ramp") as progress:
             for done, lit in enumerate(levels):
                 progress.advance(done, len(levels))
-                if asked.is_set():
+                if stop_requested.is_set():
                     break
                 exposures.append(level(lit))
     return exposures
-
-
-def _found(out: str, exposures: list[Exposure]) -> list[Finding]:
-    from acquire.calibrate.linearity import linearity as bend
-    from acquire.calibrate.transfer import transfer
-    from acquire.cli.progress import stage_progress
-
-    with stage_progress("reading the ramp") as advance:
-        first = kept(out, exposures[0], lambda known: bend(exposures, known, progress=advance))
-    return [first, kept(out, exposures[0], lambda known: transfer(exposures, known))]
-
-
-def _numbers(found: Finding) -> dict[str, object]:
-    values = {
-        name: {"value": each.value.tolist(), "uncertainty": each.uncertainty.tolist()}
-        for name, each in found.quantities.items()
-    }
-    return {"facts": found.facts, "warnings": found.warnings, **values}

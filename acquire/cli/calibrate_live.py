@@ -1,4 +1,4 @@
-"""Recordings that a calibration asks for, made by the running daemon; the instrument is left as it was."""
+"""Recordings for a calibration, made by the running daemon, which is left armed or idle as it was before."""
 
 from __future__ import annotations
 
@@ -22,25 +22,25 @@ if TYPE_CHECKING:
     from acquire.daemon.messages import LightCode, Status, TriggerDelays, TriggerWindow
 
 SEALED_S = 120.0
-"""Longest wait for a recording to be sealed, beside the time that its lines take."""
+"""Longest wait for a recording to be sealed, in addition to the duration of its lines."""
 POLL_S = 0.1
 CALM_S = 1.0
-"""Without a command under way: time for one to begin that was sent just before this was interrupted."""
+"""Time without a running command after an interrupt: a command sent just before it may still begin."""
 TRIES = 3
 BY = "ACQUIRE_BY"
-"""Environment variable: who asked for this, where it is the page that carries it out for them."""
+"""Environment variable with the name of the user on whose behalf the operator's page runs the command."""
 MOST_LOST = 0.1
-"""Of a recording's lines: a calibration does without some."""
+"""Share of a recording's lines that may be lost without harm to the calibration."""
 
 
 @contextmanager
 def instrument(socket: Path | None, directory: Path) -> Iterator[Client]:
-    """The daemon, idle or armed; in the end it is as it was. ``directory`` is made."""
-    from acquire.cli.progress import teller
+    """Connect to an idle or armed daemon, create ``directory``, and restore the daemon's state at the end."""
+    from acquire.cli.progress import waiting_printer
     from acquire.client import Client
 
     WHO.set(os.environ.get(BY, "")[:LONGEST])
-    with Client(socket, teller()) as daemon:
+    with Client(socket, waiting_printer()) as daemon:
         status = daemon.status()
         if status.state not in ("idle", "armed"):
             raise StateError(
@@ -66,18 +66,23 @@ def record(
     delays: TriggerDelays | None = None,
     window: TriggerWindow | None = None,
 ) -> Exposure:
-    """Arm with the light and the timing that are wanted, record ``NAME-1.zarr`` or the next free, disarm.
+    """Arm with the given light and timing, record ``NAME-1.zarr`` (or the next free number) and disarm.
 
-    Again where lines were lost, which a busy host may do; DataError where they are each time.
+    A recording that lost lines, as on a busy host, is repeated. Raises DataError if every attempt lost lines.
     """
     from acquire.calibrate.exposure import open_exposure
+    from acquire.client import SEALED
     from acquire.store import open_recording
 
     for _ in range(TRIES):
         if daemon.status().state == "armed":
             daemon.disarm()
         daemon.arm(code=code, calibration="none", delays=delays, window=window)
-        path = _recorded(daemon, free(directory, name), lines)
+        path = free_path(directory, name)
+        status = daemon.start(path, lines=lines)
+        rates = [arm.rate_hz for arm in status.arms.values() if arm.rate_hz > 0]
+        daemon.wait(SEALED, timeout_s=SEALED_S + lines / min(rates, default=1000.0))
+        daemon.disarm()
         made = open_recording(path)
         missing = max(0, lines - made.lines) + sum(gap.count for gap in made.gaps)
         if missing <= MOST_LOST * lines:
@@ -86,44 +91,38 @@ def record(
         print_warning(f"{path} lacks {missing} lines of {lines} per arm ({ended})")
     raise DataError(
         f"{TRIES} recordings lacked lines, the last one {missing} of {lines} per arm ({ended})",
-        possible=f"up to {int(MOST_LOST * lines)}, of both arms together",
-        hint="acquire bench (does this host keep up?); a longer stream.stall_s, where it only begins late",
+        possible=f"up to {int(MOST_LOST * lines)} missing lines of both arms together",
+        hint="acquire bench, to check whether this host keeps up; a longer stream.stall_s, if it only starts "
+        "late",
     )
 
 
-def _recorded(daemon: Client, path: Path, lines: int) -> Path:
-    from acquire.client import SEALED
-
-    status = daemon.start(path, lines=lines)
-    rates = [arm.rate_hz for arm in status.arms.values() if arm.rate_hz > 0]
-    daemon.wait(SEALED, timeout_s=SEALED_S + lines / min(rates, default=1000.0))
-    daemon.disarm()
-    return path
-
-
-def free(directory: Path, name: str) -> Path:
-    """A name that nothing has yet: what was recorded before stays."""
+def free_path(directory: Path, name: str) -> Path:
+    """Return the first path ``NAME-<number>.zarr`` that does not exist: earlier recordings are kept."""
     number = 1
     while (path := directory.absolute() / f"{name}-{number}.zarr").exists():
         number += 1
     return path
 
 
-def kept(out: str, exposure: Exposure, look: Callable[[Calibration], Finding]) -> Finding:
-    """Look, and add what was found to the calibration at a place. UsageError where nothing can be told."""
+def save_finding(out: str, exposure: Exposure, evaluate: Callable[[Calibration], Finding]) -> Finding:
+    """Evaluate an exposure and add the result to the calibration at ``out``.
+
+    Raises UsageError if the exposure does not determine the orientation.
+    """
     from acquire.calibrate import Calibration, open_calibration, save_calibration
     from acquire.store.source import source_of
 
     known = open_calibration(out) if source_of(out).exists() else Calibration(exposure.instrument)
-    found = look(known)
+    found = evaluate(known)
     if found.step == "orientation" and found.orientation is None:
         raise UsageError(f"orientation: {found.warnings[0]}")
     save_calibration(out, known.with_step(found))
     return found
 
 
-def tell_finding(found: Finding, more: Mapping[str, Any] | None = None) -> None:
-    """Print what was found, ``more`` facts after it, and its warnings."""
+def print_finding(found: Finding, more: Mapping[str, Any] | None = None) -> None:
+    """Print a finding, ``more`` facts after it, and its warnings."""
     from acquire.calibrate.words import found_facts
 
     print_facts(found_facts(found) | dict(more or {}))
@@ -132,16 +131,16 @@ def tell_finding(found: Finding, more: Mapping[str, Any] | None = None) -> None:
 
 
 def wait_for_enter() -> None:
-    """StateError where nobody can press it."""
-    note("Enter goes on, Ctrl-C ends; what was found so far is kept")
+    """Wait for Enter. Raises StateError if standard input is closed."""
+    note("press Enter to continue, or Ctrl-C to end; the results so far are saved")
     if not sys.stdin.readline():
-        raise StateError("nobody is there to press Enter", hint="--yes, where everything is in place")
+        raise StateError("nobody is there to press Enter", hint="--yes, if everything is in place")
 
 
 def _settled(daemon: Client, calm_s: float) -> Status:
-    """The status once no command has been under way for so long.
+    """Return the status once no command has been running for ``calm_s``.
 
-    An interrupt does not call back an arm that has been sent.
+    After an interrupt, a command that was already sent (such as arm) is still carried out.
     """
     begun = busy_at = time.monotonic()
     while True:
@@ -156,12 +155,14 @@ def _settled(daemon: Client, calm_s: float) -> Status:
 
 
 def _leave(daemon: Client, directory: Path, *, armed: bool) -> None:
-    """The instrument as it was before; but what somebody else records meanwhile is theirs."""
+    """Restore the state of the instrument, unless somebody else has started a recording in the meantime."""
     from acquire.client import SEALED
 
     status = daemon.status()
     if status.recording is not None and status.recording.path.parent != directory.absolute():
-        print_warning(f"{status.recording.path} is somebody else's: the instrument is left to them")
+        print_warning(
+            f"{status.recording.path} is somebody else's recording, so the instrument stays as it is"
+        )
         return
     if status.state == "recording":
         daemon.stop()

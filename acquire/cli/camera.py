@@ -1,9 +1,9 @@
-"""``acquire camera features | snapshot | live``: look at a camera before it is used."""
+"""``acquire camera features | snapshot | live``: inspect a camera before it is used."""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
@@ -20,21 +20,29 @@ ConfigOption = Annotated[
         "-c",
         metavar="FILE",
         autocompletion=rigs,
-        help="Rig file; absent: every camera of GENICAM_GENTL64_PATH is searched.",
+        help="Rig file, or the name of a built-in one. Default: search all cameras that the GenTL producers "
+        "in GENICAM_GENTL64_PATH show.",
     ),
 ]
-SerialArgument = Annotated[str, typer.Argument(help="Serial number: acquire devices lists them.")]
+SerialArgument = Annotated[
+    str, typer.Argument(help="Serial number of the camera. `acquire devices` lists them.")
+]
 
 
 def register(app: typer.Typer) -> None:
     group = typer.Typer(no_args_is_help=True, rich_markup_mode="rich")
     for command in (features, snapshot, live):
         group.command()(command)
-    app.add_typer(group, name="camera", help="Look at the cameras.", rich_help_panel="Rig")
+    app.add_typer(
+        group,
+        name="camera",
+        help="Inspect the cameras: their features, a picture, or live readings.",
+        rich_help_panel="Rig",
+    )
 
 
 def features(serial: SerialArgument, config: ConfigOption = None, json: JsonFlag = False) -> None:
-    """Print every feature of a camera and of the host's side of it: value, access, what is possible.
+    """Print every feature of a camera and of its driver: value, access and possible values.
 
     With a rig file the camera's settings are written first.
 
@@ -55,18 +63,25 @@ def features(serial: SerialArgument, config: ConfigOption = None, json: JsonFlag
 def snapshot(
     serial: SerialArgument,
     config: ConfigOption = None,
-    lines: Annotated[int, typer.Option(min=1, max=1_000_000, help="Number of lines of the picture.")] = 1024,
+    lines: Annotated[int, typer.Option(min=1, max=1_000_000, help="Number of lines in the picture.")] = 1024,
     out: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="New file: a picture (.png), or the values (.npy).")
+        Path | None,
+        typer.Option(
+            metavar="FILE", help="New file: a picture (.png) or the raw values (.npy). Default: SERIAL.png."
+        ),
     ] = None,
     json: JsonFlag = False,
 ) -> None:
-    """Save a picture of the next lines. With a rig file its trigger runs meanwhile.
+    """Save a picture of the next lines of a camera. With a rig file, its trigger runs at the same time.
 
-    Pictures are stretched from the darkest to the brightest value; .npy has the values as they are.
+    In a .png the grey scale is stretched from the darkest to the brightest value; a .npy holds the raw
+    values.
 
     Example: [bold]acquire camera snapshot SIM-A --config rig-demo --lines 500[/]
     """
+    import numpy as np
+    from PIL import Image
+
     from acquire.camera.look import snapshot as take
     from acquire.camera.visit import visit
 
@@ -77,7 +92,12 @@ def snapshot(
         pixels, flags = visit(
             bench.opener(serial), take, lines, seconds, timeout_s=2 * OPEN_S + seconds, armed=bench.pulse
         )
-    _save(path, pixels)
+    if path.suffix.lower() == ".npy":
+        np.save(path, pixels)
+    else:
+        low, span = int(pixels.min()), max(1, int(pixels.max()) - int(pixels.min()))
+        stretched = np.rint((pixels.astype(np.float32) - low) * (255 / span)).astype(np.uint8)
+        Image.fromarray(stretched).save(path)
     facts = {
         "picture": str(path),
         "lines": len(pixels),
@@ -94,23 +114,16 @@ def snapshot(
 def _check_out(path: Path) -> None:
     if path.suffix.lower() not in (".png", ".npy"):
         raise UsageError(
-            f"snapshot to {path}: its suffix is that of no format",
+            f"a snapshot cannot be saved as {path.name}: its suffix is not a known format",
             possible=".png, .npy",
             hint=f"--out {path.with_suffix('.png')}",
         )
     if path.exists():
-        raise UsageError(f"snapshot to {path}: it exists and stays untouched", hint="--out with a new file")
+        raise UsageError(
+            f"a snapshot cannot be saved to {path}: the file exists and is not overwritten",
+            hint="--out with a new file",
+        )
     if not path.absolute().parent.is_dir():
-        raise UsageError(f"snapshot to {path}: there is no directory {path.absolute().parent}")
-
-
-def _save(path: Path, pixels: Any) -> None:
-    import numpy as np
-    from PIL import Image
-
-    if path.suffix.lower() == ".npy":
-        np.save(path, pixels)
-        return
-    low, span = int(pixels.min()), max(1, int(pixels.max()) - int(pixels.min()))
-    stretched = np.rint((pixels.astype(np.float32) - low) * (255 / span)).astype(np.uint8)
-    Image.fromarray(stretched).save(path)
+        raise UsageError(
+            f"a snapshot cannot be saved to {path}: there is no directory {path.absolute().parent}"
+        )

@@ -1,4 +1,4 @@
-"""Cameras on the bench: a rig's, with its trigger, or one that the environment's producers show."""
+"""Cameras on the bench: those of a rig, with its trigger, or one found through GenTL producers."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _LISTEN_S = 0.2
 
 
 class Bench:
-    """A rig to look at, or, without a file, whatever the environment's producers show."""
+    """A rig under inspection; without a rig file, any camera that the environment's GenTL producers show."""
 
     def __init__(self, config: str | None, code: LightCode = "rig") -> None:
         from acquire.config import load_rig
@@ -43,7 +43,7 @@ class Bench:
         return self._rig.openers()[self.arms(serial)[0]]
 
     def arms(self, serial: str) -> list[str]:
-        """Those that the rig's camera with this serial number has. UsageError where it has none."""
+        """Return the arms of the rig's camera with this serial number. Raises UsageError if there is none."""
         from acquire.lines import ARMS
 
         assert self.config is not None
@@ -55,7 +55,7 @@ class Bench:
         return [arm for arm in ARMS if serials[arm] == serial]
 
     def pulse(self) -> None:
-        """Let the rig's trigger run; a camera without a rig has its own."""
+        """Start the rig's trigger. A camera without a rig has its own trigger."""
         if self._rig is not None and self.config is not None:
             from acquire.daemon.plan import trigger_run
 
@@ -64,7 +64,10 @@ class Bench:
             self._listener.start()
 
     def _listen(self) -> None:
-        """Take the trigger's tags, which keeps its watchdog quiet. A dead link is the camera's silence."""
+        """Read the trigger's tags, which keeps its watchdog from ending the run.
+
+        A broken link is not reported here: the camera then delivers no lines.
+        """
         assert self._rig is not None
         with suppress(TriggerError):
             while not self._ending.wait(_LISTEN_S):

@@ -1,4 +1,4 @@
-"""What ``acquire camera live`` shows: bars for the light, a running line for the focus, and what is wrong."""
+"""The display of ``acquire camera live``: bars for the light, a sparkline for the focus, and advice."""
 
 from __future__ import annotations
 
@@ -19,18 +19,18 @@ if TYPE_CHECKING:
 
 BAR, LABEL = 32, 9
 TURNS = 32
-"""Of the focus number that are shown."""
+"""Number of focus values in the sparkline."""
 _BLOCKS = "▁▂▃▄▅▆▇█"
 _EIGHTHS = " ▏▎▍▌▋▊▉█"
 STEADY = 0.02
-"""Spread of the focus number, beside itself, below which its line is flat: it would show noise."""
+"""Relative spread of the focus number below which the sparkline stays flat, because it would show noise."""
 SATURATED, DIM, BRIGHT = 1e-4, 0.05, 0.85
-"""Part of the pixels that are white, and levels, from which on something is said."""
+"""Share of saturated pixels, and levels, at which advice is given."""
 DARK = 0.01
 
 
 class Screen:
-    """A renderable; `show` changes what it is of."""
+    """A rich renderable of the latest readings, which `show` sets."""
 
     def __init__(self, names: dict[str, str], where: str, turn_s: float) -> None:
         self._names, self._where, self._turn_s = names, where, turn_s
@@ -49,10 +49,10 @@ class Screen:
         parts: list[RenderableType] = []
         for name, serial in self._names.items():
             parts.append(self._rows(name, serial))
-            if said := advice(self._readings.get(name)):
-                parts.append(Text(" " * (LABEL + 2) + said, style="yellow"))
+            if hint := advice(self._readings.get(name)):
+                parts.append(Text(" " * (LABEL + 2) + hint, style="yellow"))
             parts.append(Text(""))
-        return Group(*parts, Text(f"looking at {visible(self._where)}; Ctrl-C ends", style="dim"))
+        return Group(*parts, Text(f"source: {visible(self._where)}; press Ctrl-C to end", style="dim"))
 
     def _rows(self, name: str, serial: str) -> Table:
         grid = Table.grid(padding=(0, 2))
@@ -71,20 +71,20 @@ class Screen:
         grid.add_row("brightest", Text(bar(reading.brightest), style), f"{reading.brightest:.1%}")
         grid.add_row("saturated", "", f"{reading.saturated or 0.0:.2%}", "of the pixels")
         now, best = reading.focus, self._best[name]
-        line = Text(running(list(self._focus[name])), "cyan")
+        line = Text(sparkline(list(self._focus[name])), "cyan")
         grid.add_row("focus", line, "–" if now is None else f"{now:.2%}", f"best {best:.2%}" if best else "")
         return grid
 
 
 def bar(part: float) -> str:
-    """A bar of ``part`` of its whole length."""
+    """Draw a bar that is filled to ``part`` (0 to 1)."""
     eighths = round(min(max(part, 0.0), 1.0) * BAR * 8)
     full, rest = divmod(eighths, 8)
     return ("█" * full + (_EIGHTHS[rest] if rest else "")).ljust(BAR, "·")
 
 
-def running(values: list[float]) -> str:
-    """Values as heights, the newest last, between the least and the most of them."""
+def sparkline(values: list[float]) -> str:
+    """Draw values as heights between their minimum and maximum, with the newest last."""
     if not values:
         return ""
     low, high = min(values), max(values)
@@ -96,29 +96,29 @@ def running(values: list[float]) -> str:
 
 
 def advice(reading: Reading | None) -> str:
-    """What is wrong, and what to do; nothing where nothing is."""
+    """Return the problem with a reading and what to do about it; empty if there is none."""
     if reading is None:
-        return "the camera tells nothing"
+        return "the camera does not respond"
     if reading.level is None:
-        return "no lines come: is the trigger running, and its cable on the camera's input?"
+        return "no lines are arriving: is the trigger running, and its cable connected to the camera's input?"
     for wrong, text in (
-        (reading.lost > 0, f"{reading.lost} lines were lost: acquire status, or the camera's settings"),
-        ((reading.saturated or 0.0) > SATURATED, "saturated: less light, or a smaller aperture"),
-        (reading.level < DARK, "dark: is the light on, the lens open?"),
-        (reading.level < DIM, "dim: more light, or a larger aperture"),
-        (reading.level > BRIGHT, "very bright: less light, or a smaller aperture"),
+        (reading.lost > 0, f"{reading.lost} lines were lost: check acquire status and the camera's settings"),
+        ((reading.saturated or 0.0) > SATURATED, "saturated: use less light or a smaller aperture"),
+        (reading.level < DARK, "dark: is the light on and the lens open?"),
+        (reading.level < DIM, "dim: use more light or a larger aperture"),
+        (reading.level > BRIGHT, "very bright: use less light or a smaller aperture"),
     ):
         if wrong:
             return text
     return ""
 
 
-def words(reading: Reading | None) -> str:
-    """On one line."""
+def reading_text(reading: Reading | None) -> str:
+    """Format a reading on one line."""
     if reading is None or reading.level is None:
         return advice(reading)
     focus = "–" if reading.focus is None else f"{reading.focus:.2%}"
-    said = advice(reading)
+    hint = advice(reading)
     return f"level {reading.level:.1%}, saturated {reading.saturated:.2%}, focus {focus}" + (
-        f" ({said})" if said else ""
+        f" ({hint})" if hint else ""
     )

@@ -1,8 +1,8 @@
-"""Values of options without pydantic, where nothing has to be checked: its import takes longer than `status`.
+"""Coercion of option values without pydantic, whose import takes longer than the command `status`.
 
-Typer builds a validator of pydantic's for every option of a command, also for those that nobody gave. Here
-absent values stay absent, and texts, paths and numbers are taken as they are; whatever else there is, and
-whatever is wrong, goes to typer's own validator, which has the words for it.
+Typer builds a pydantic validator for every option of a command, even for options that were not given. Here
+absent values stay absent, and texts, paths and numbers are converted directly. Other types, and values that
+cannot be converted, are passed to typer's own validator, which also formats the error.
 """
 
 from __future__ import annotations
@@ -14,70 +14,59 @@ import typer
 
 PLAIN = (str, Path, int, float, bool)
 _NOT = {int: "{} is not a whole number", float: "{} is not a number", Path: "{} is not a path"}
+_CHECKS = ("exists", "writable", "resolve_path", "allow_dash", "path_type", "click_type")
+"""Properties of an option whose values typer must validate itself: a path that has to exist, for example."""
 
 
 class Quick:
-    """Takes the values of one option; ``slow`` makes typer's own way of taking them."""
+    """Converts the values of one option; ``_slow`` builds typer's own validator."""
 
     def __init__(self, parameter: Any) -> None:
         self._slow = parameter.get_runtime_param
         about = parameter.type_descriptor
-        checked = about.is_file or about.is_choice or _checked(about.parameter_info)
-        kind = about.parameter_info.parser or (about.annotation if about.annotation in PLAIN else None)
+        info = about.parameter_info
+        checked = about.is_file or about.is_choice or any(getattr(info, name, None) for name in _CHECKS)
+        kind = info.parser or (about.annotation if about.annotation in PLAIN else None)
         self._type: Any = None if checked else kind
-        self._least, self._most = about.parameter_info.min, about.parameter_info.max
+        self._least, self._most = info.min, info.max
 
     def coerce(self, value: Any, param: Any, ctx: Any) -> Any:
+        """Return the converted value. Raises typer.BadParameter if it is invalid or out of range."""
         several = param.multiple or param.nargs == -1
         if value is None and not several:
             return None
         if isinstance(value, bool) and self._type is bool:
             return value
+        if self._type in (None, bool) or several:
+            return self._slow().coerce(value, param=param, ctx=ctx)
         try:
-            if self._type not in (None, bool) and not several:
-                return self._within(self._type(value), ctx, param)
-        except OutOfRange:
-            raise
-        except typer.BadParameter:
-            pass  # it is raised again, with the option's name
+            found = self._type(value)
+        except typer.BadParameter:  # of a parser of ours: typer calls it again and adds the option's name
+            return self._slow().coerce(value, param=param, ctx=ctx)
         except ValueError:
             raise typer.BadParameter(_NOT[self._type].format(repr(value)), ctx=ctx, param=param) from None
-        return self._slow().coerce(value, param=param, ctx=ctx)
-
-    def _within(self, value: Any, ctx: Any, param: Any) -> Any:
-        """The value. typer.BadParameter where it is out of the option's range."""
         least, most = self._least, self._most
-        if not (least is None or value >= least) or not (most is None or value <= most):  # nan is neither
+        if not (least is None or found >= least) or not (most is None or found <= most):  # true for nan, too
             possible = f"{most:g} or less" if least is None else f"{least:g} or more"
             if least is not None and most is not None:
                 possible = f"{least:g} to {most:g}"
-            raise OutOfRange(f"{value} is out of range: {possible}", ctx=ctx, param=param)
-        return value
+            raise typer.BadParameter(f"{found} is out of range: {possible}", ctx=ctx, param=param)
+        return found
 
 
-class OutOfRange(typer.BadParameter):
-    """A number that is one, and not in the range of its option."""
-
-
-def ease(command: Any) -> None:
-    """Have a command, and those below it, take values quickly; other versions of typer are left alone."""
+def use_quick_coercion(command: Any) -> None:
+    """Replace the validators of a command and its subcommands; unknown versions of typer are left alone."""
     for parameter in command.params:
-        _ease(parameter)
+        _replace(parameter)
     makes_help = command.get_help_option
-    command.get_help_option = lambda ctx: _ease(makes_help(ctx))
+    command.get_help_option = lambda ctx: _replace(makes_help(ctx))
     for below in getattr(command, "commands", {}).values():
-        ease(below)
+        use_quick_coercion(below)
 
 
-def _ease(parameter: Any) -> Any:
+def _replace(parameter: Any) -> Any:
     known = hasattr(parameter, "get_runtime_param") and hasattr(parameter, "type_descriptor")
     if known and not hasattr(parameter, "quick"):
         parameter.quick = quick = Quick(parameter)
         parameter.get_runtime_param = lambda: quick
     return parameter
-
-
-def _checked(about: Any) -> bool:
-    """A path that must exist, be readable, and so on."""
-    asks = ("exists", "writable", "resolve_path", "allow_dash", "path_type", "click_type")
-    return any(getattr(about, name, None) for name in asks)

@@ -1,7 +1,7 @@
-"""Tab in bash, zsh and fish: ``acquire completion SHELL``, and what is offered for the words of commands.
+"""Tab completion in bash, zsh and fish: ``acquire completion SHELL``, and the completions of arguments.
 
-The functions are called while a word is being typed: they import little, and what they cannot find out, or
-what a shell could take for more than a name, they leave out.
+The completion functions run while a word is being typed, so they import little. They leave out anything that
+they cannot determine, and names with characters that a shell could interpret.
 """
 
 from __future__ import annotations
@@ -30,13 +30,14 @@ def register(app: typer.Typer) -> None:
 
 def completion(
     shell: Annotated[
-        Literal["bash", "zsh", "fish"], typer.Argument(metavar="SHELL", help="Shell: bash, zsh or fish.")
+        Literal["bash", "zsh", "fish"],
+        typer.Argument(metavar="SHELL", help="Your shell: bash, zsh or fish."),
     ],
 ) -> None:
-    """Print the script that lets Tab complete commands, options, configurations, states and recordings.
+    """Print the script for Tab completion of commands, options, configurations, states and recordings.
 
-    For bash: eval "$(acquire completion bash)" in ~/.bashrc. For zsh the same with zsh in ~/.zshrc, after
-    compinit. For fish: acquire completion fish > ~/.config/fish/completions/acquire.fish
+    For bash, add eval "$(acquire completion bash)" to ~/.bashrc. For zsh, add the same line with zsh to
+    ~/.zshrc, after compinit. For fish: acquire completion fish > ~/.config/fish/completions/acquire.fish
 
     Example: [bold]acquire completion bash[/]
     """
@@ -48,8 +49,8 @@ def completion(
 
 
 def words_so_far() -> list[str]:
-    """The words before the one that is being typed, as the scripts hand them over."""
-    typed = os.environ.get("COMP_WORDS")  # bash; zsh and fish have typer's own variable
+    """Return the words before the one being typed, as passed by the completion script."""
+    typed = os.environ.get("COMP_WORDS")  # set by bash; zsh and fish use typer's own variable
     if typed is not None:
         words = typed.split()
         return words[1 : int(os.environ.get("COMP_CWORD", len(words)))]
@@ -59,7 +60,7 @@ def words_so_far() -> list[str]:
 
 
 def complete(command: Any) -> int:
-    """Print what fits the words in the environment; the exit code."""
+    """Print the completions of the command line in the environment; return the exit code."""
     from typer.completion import completion_init  # type: ignore[attr-defined]
 
     completion_init()
@@ -72,7 +73,7 @@ def complete(command: Any) -> int:
 
 
 def _without_help(command: Any) -> None:
-    """Names alone: to show help beside them costs half a second for every Tab, and breaks lines in fish."""
+    """Remove the help texts: showing them costs half a second for every Tab, and breaks lines in fish."""
     command.help = command.short_help = None
     for parameter in command.params:
         parameter.help = None
@@ -81,32 +82,32 @@ def _without_help(command: Any) -> None:
 
 
 def states(incomplete: str) -> list[str]:
-    """Of the daemon, and ``sealed``: see `acquire.daemon.states`."""
+    """Complete the daemon's states and ``sealed``, see `acquire.daemon.states`."""
     return [state for state in STATES if state.startswith(incomplete)]
 
 
 def recordings(incomplete: str) -> list[str]:
-    """Recordings and videos (NAME.zarr), and directories on the way to them."""
+    """Complete recordings and videos (NAME.zarr), and directories that may contain some."""
     return _paths(incomplete, (".zarr",))
 
 
 def rigs(incomplete: str) -> list[str]:
-    """Built-in rigs, and TOML files."""
+    """Complete built-in rigs and TOML files."""
     return _configurations(incomplete, "rig-")
 
 
 def scenes(incomplete: str) -> list[str]:
-    """Built-in scenes, TOML files, and what else a scene can be made of."""
+    """Complete built-in scenes, TOML files, and other files that a scene can be made from."""
     return [*_built_in(incomplete, "scene-"), *_paths(incomplete, (".toml", ".npy", ".png", ".mp4"))]
 
 
 def plans(incomplete: str) -> list[str]:
-    """Built-in plans, and TOML files."""
+    """Complete built-in plans and TOML files."""
     return _configurations(incomplete, "plan-")
 
 
 def configurations(incomplete: str) -> list[str]:
-    """Built-in rigs, scenes and plans, and TOML files."""
+    """Complete built-in rigs, scenes and plans, and TOML files."""
     return _configurations(incomplete, "")
 
 
@@ -121,7 +122,7 @@ def _built_in(incomplete: str, kind: str) -> list[str]:
 
 
 def _paths(incomplete: str, suffixes: Iterable[str]) -> list[str]:
-    """Files and directories that begin so and end so, and directories, which may hold more."""
+    """Complete paths with one of the suffixes, and other directories, which may contain some."""
     parent, _, begun = incomplete.rpartition("/")
     base = Path(f"{parent}/" if incomplete.startswith("/") or parent else ".")
     found = []

@@ -1,4 +1,4 @@
-"""``acquire config list | check | show | schema``: configurations without devices."""
+"""``acquire config list | check | show | schema``: work with configurations, without opening devices."""
 
 from __future__ import annotations
 
@@ -21,13 +21,12 @@ if TYPE_CHECKING:
 FileArgument = Annotated[
     str,
     typer.Argument(
-        metavar="FILE", autocompletion=configurations, help="Rig file, or the name of a built-in one."
+        metavar="FILE", autocompletion=configurations, help="Rig file, or the name of a built-in rig."
     ),
 ]
 
-
 USED_BY = {
-    "rig": "serve, arm and everything with --config",
+    "rig": "serve, arm and all commands with --config",
     "scene": "simulate, and a rig's simulated cameras",
     "plan": "reconstruct --plan",
 }
@@ -50,11 +49,11 @@ def register(app: typer.Typer) -> None:
 def list_configurations(
     kind: Annotated[
         Literal["rig", "scene", "plan"] | None,
-        typer.Argument(metavar="KIND", help="Kind of configuration: rig, scene or plan; absent: all."),
+        typer.Argument(metavar="KIND", help="Kind of configuration: rig, scene or plan. Default: all kinds."),
     ] = None,
     json: JsonFlag = False,
 ) -> None:
-    """List the configurations that come with the program, by kind: rigs, scenes and plans.
+    """List the built-in configurations by kind: rigs, scenes and plans.
 
     Example: [bold]acquire config list scene[/]
     """
@@ -77,7 +76,7 @@ def list_configurations(
 
 
 def _about(name: str) -> str:
-    """The first sentence of the comment that a file begins with; its title or name where it has none."""
+    """Return the first sentence of a file's leading comment; its title or name if there is none."""
     import tomllib
 
     from acquire.place import builtin_directory
@@ -92,7 +91,7 @@ def _about(name: str) -> str:
 
 
 def check(file: FileArgument, json: JsonFlag = False) -> None:
-    """Validate a rig file, its scene and its directory; say what it amounts to.
+    """Validate a rig file, its scene and its recording directory, and print a summary.
 
     Example: [bold]acquire config check rig-demo[/]
     """
@@ -128,7 +127,7 @@ def check(file: FileArgument, json: JsonFlag = False) -> None:
 
 
 def show(file: FileArgument, json: JsonFlag = False) -> None:
-    """The whole configuration with every default filled in: TOML that can be used as a file.
+    """Print the whole configuration with all defaults filled in, as TOML that can be used as a rig file.
 
     Example: [bold]acquire config show rig-demo[/]
     """
@@ -144,12 +143,13 @@ def show(file: FileArgument, json: JsonFlag = False) -> None:
 
 def schema(
     of: Annotated[
-        Literal["rig", "scene", "plan"], typer.Option("--of", help="The kind of file that it describes.")
+        Literal["rig", "scene", "plan"],
+        typer.Option("--of", help="Kind of file to describe: rig, scene or plan."),
     ] = "rig",
 ) -> None:
-    """JSON schema of rig, scene or plan files, for editors: every key, its limits and default.
+    """Print the JSON schema of rig, scene or plan files for editors: every key, its limits and default.
 
-    It holds what is installed now, plug-ins with it.
+    The schema covers everything that is installed now, including plug-ins.
 
     Example: [bold]acquire config schema > rig.schema.json[/]
     """
@@ -187,7 +187,11 @@ def _facts(rig: RigConfig) -> dict[str, Any]:
 
 
 def dotted(table: dict[str, Any], prefix: str = "") -> Iterator[str]:
-    """``a.b = value`` per leaf: JSON's numbers, texts, booleans and lists are TOML's, null is no key."""
+    """Yield ``a.b = value`` for every leaf of a table.
+
+    Numbers, texts, booleans and lists are written the same in JSON and TOML; a key with the value null is
+    left out.
+    """
     for key, value in table.items():
         if isinstance(value, dict):
             yield from dotted(value, f"{prefix}{key}.")

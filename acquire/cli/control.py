@@ -1,4 +1,4 @@
-"""``acquire arm | start | stop | disarm | status | reload``: one command to the daemon each."""
+"""``acquire arm | start | mark | stop | disarm | status | reload``: each sends one command to the daemon."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ SocketOption = Annotated[
     Path | None, typer.Option("--socket", envvar="ACQUIRE_SOCKET", help="Control socket of the daemon.")
 ]
 SEALED_WORD = "sealed"
-"""For ``status --wait``: any state in which no recording is under way."""
+"""Argument of ``status --wait``: any state in which no recording is in progress."""
 DAMAGED = ("INCOMPLETE", "ABORTED", None)
-"""Conditions of a recording that lost something."""
+"""Conditions of a recording that lost lines."""
 
 
 def register(app: typer.Typer) -> None:
@@ -35,35 +35,37 @@ def register(app: typer.Typer) -> None:
 def arm(
     force: Annotated[
         bool,
-        typer.Option("--force", help="Arm even if this host is too slow or the store of uploads refuses."),
+        typer.Option(
+            "--force", help="Arm even if this host is too slow or the store for uploads denies access."
+        ),
     ] = False,
     code: Annotated[
         str,
-        typer.Option(
-            help="What the light follows: rig (the rig's code), dark (it stays off) or steady (it stays on)."
-        ),
+        typer.Option(help="Light: rig (follow the rig's code), dark (stay off) or steady (stay on)."),
     ] = "rig",
     without_calibration: Annotated[
         bool,
         typer.Option(
-            "--without-calibration", help="Recordings get no copy of the calibration in the rig file."
+            "--without-calibration",
+            help="Do not copy the calibration named in the rig file into the recordings.",
         ),
     ] = False,
     socket: SocketOption = None,
     json: JsonFlag = False,
 ) -> None:
-    """Start trigger and cameras; nothing is written yet.
+    """Start the trigger and the cameras without recording.
 
-    The daemon measures first what ring, codec and disk sustain here (a second; valid for ten minutes), and
-    refuses, exit code 2, where the best of three measurements is less than what is configured; simulated
-    cameras wait for a busy host, and get a warning. So it does where recordings are to be
-    uploaded and the store says no; one that cannot be reached is a warning.
+    The daemon first measures which line rate the ring, the codec and the disk sustain on this host. This
+    takes a second and is valid for ten minutes. If the best of three measurements is below the configured
+    rate, arm is refused with exit code 2; with simulated cameras, which wait for a busy host, it is only a
+    warning. Arm is also refused if recordings are to be uploaded and the store denies access; a store that
+    cannot be reached is only a warning.
 
     Example: [bold]acquire arm[/]
     """
     with _daemon(socket) as daemon:
         calibration = "none" if without_calibration else "rig"
-        status = daemon.arm(force=force, code=code, calibration=calibration)  # type: ignore[arg-type]  # checked there
+        status = daemon.arm(force=force, code=code, calibration=calibration)  # type: ignore[arg-type]  # checked by the daemon
     show(status, json)
     if status.calibration is not None and not status.calibration.carried:
         print_warning(f"recordings carry no calibration: {status.calibration.text}")
@@ -72,19 +74,21 @@ def arm(
 def start(
     path: Annotated[
         Path | None,
-        typer.Argument(metavar="RECORDING", help="New recording NAME.zarr; absent: named by rig and time."),
+        typer.Argument(
+            metavar="RECORDING", help="New recording NAME.zarr. Default: a name made of the rig and the time."
+        ),
     ] = None,
     lines: Annotated[int | None, typer.Option(help="End after this number of lines.")] = None,
     duration: Annotated[
         float | None,
-        typer.Option(parser=seconds, metavar="TIME", help="End after this time: 5, 5s, 500ms, 2min."),
+        typer.Option(parser=seconds, metavar="TIME", help="End after this time, such as 5s, 500ms or 2min."),
     ] = None,
     pre: Annotated[
         float | None,
         typer.Option(
             parser=seconds,
             metavar="TIME",
-            help="Begin this long before the command, with lines that the rings still hold.",
+            help="Begin this long before the command, with lines that are still in the ring buffers.",
         ),
     ] = None,
     post: Annotated[
@@ -92,16 +96,19 @@ def start(
         typer.Option(
             parser=seconds,
             metavar="TIME",
-            help="End this long after the command, whatever --pre adds before it.",
+            help="End this long after the command, regardless of --pre.",
         ),
     ] = None,
     resume: Annotated[
-        bool, typer.Option("--resume", help="Continue a sealed RECORDING in a new segment beside it.")
+        bool,
+        typer.Option("--resume", help="Continue a sealed RECORDING in a new segment next to it."),
     ] = False,
     socket: SocketOption = None,
     json: JsonFlag = False,
 ) -> None:
-    """Record from the next line on, or from before it; until stopped, or for some lines or time.
+    """Start recording, from the next line or from a few seconds ago.
+
+    The recording ends at `acquire stop`, or after the given number of lines or time.
 
     Example: [bold]acquire start run.zarr --lines 100000[/], or [bold]acquire start --pre 2s --post 1s[/]
     """
@@ -113,11 +120,12 @@ def start(
 
 
 def mark(
-    text: Annotated[str, typer.Argument(help="Text of the mark: what happens, in your words.")] = "",
+    text: Annotated[str, typer.Argument(help="Text of the mark, in your own words.")] = "",
     socket: SocketOption = None,
     json: JsonFlag = False,
 ) -> None:
-    """Note that something happens now. While armed it starts a recording, where the rig's events say so.
+    """Mark the current moment in the recording. While armed, a mark can start one, if the rig's events say
+    so.
 
     Example: [bold]acquire mark "the valve opens"[/]
     """
@@ -126,9 +134,9 @@ def mark(
 
 
 def stop(socket: SocketOption = None, json: JsonFlag = False) -> None:
-    """End the recording; returns once it is sealed. Exit code 6 if lines were lost.
+    """End the recording and wait until it is sealed. The exit code is 6 if lines were lost.
 
-    The instrument stays armed for the next recording, unless the rig says recording.after = "idle".
+    The instrument stays armed for the next recording, unless the rig file has recording.after = "idle".
 
     Example: [bold]acquire stop[/]
     """
@@ -142,7 +150,7 @@ def stop(socket: SocketOption = None, json: JsonFlag = False) -> None:
 
 
 def disarm(socket: SocketOption = None, json: JsonFlag = False) -> None:
-    """Stop trigger and cameras, or clear a fault.
+    """Stop the trigger and the cameras, or clear a fault.
 
     Example: [bold]acquire disarm[/]
     """
@@ -151,11 +159,11 @@ def disarm(socket: SocketOption = None, json: JsonFlag = False) -> None:
 
 
 def reload(socket: SocketOption = None, json: JsonFlag = False) -> None:
-    """Have the service read its rig file anew, and apply what has changed, also while it records.
+    """Make the daemon read its rig file again and apply the changes, even while it records.
 
-    The log level, hooks, the page, the disk's reserve and what is kept of endless recordings can change. A
-    file that changes anything else, such as cameras, geometry or code, is refused as a whole, exit code 2,
-    with the keys: end the service when it is idle and start it anew.
+    These settings can change: the log level, hooks, the operator's page, the disk reserve and the retention
+    of endless recordings. If the file changes anything else, such as cameras, geometry or code, it is refused
+    as a whole with exit code 2 and a list of the keys; restart the daemon while it is idle to apply those.
 
     Example: [bold]acquire reload[/]
     """
@@ -167,7 +175,7 @@ def reload(socket: SocketOption = None, json: JsonFlag = False) -> None:
     for one in done.changed:
         say(f"{one.key} = {shown(one.new)} {one.holds}; it was {shown(one.old)}")
     if not done.changed:
-        say(f"{done.file} says what it said before")
+        say(f"{done.file} has not changed")
 
 
 def status(
@@ -175,29 +183,32 @@ def status(
         str | None,
         typer.Option(
             metavar="STATE",
-            help="First wait for this state of the daemon, or for 'sealed': no recording is under way.",
+            help="First wait for this state of the daemon, or for 'sealed': no recording in progress.",
             autocompletion=states,
         ),
     ] = None,
     timeout: Annotated[
         float,
         typer.Option(
-            parser=seconds, metavar="TIME", help="Longest time that --wait waits; then exit code 4."
+            parser=seconds,
+            metavar="TIME",
+            help="Longest time to --wait for the state; then exit with code 4.",
         ),
     ] = 60.0,
     watch: Annotated[
-        bool, typer.Option("--watch", "-w", help="Show the status again and again, until Ctrl-C.")
+        bool, typer.Option("--watch", "-w", help="Keep showing the status until Ctrl-C.")
     ] = False,
     every: Annotated[
         float,
-        typer.Option(parser=seconds, metavar="TIME", help="Time from one answer of --watch to the next."),
+        typer.Option(parser=seconds, metavar="TIME", help="Time between two updates of --watch."),
     ] = 1.0,
     socket: SocketOption = None,
     json: JsonFlag = False,
 ) -> None:
     """Show what the daemon is doing, and how well.
 
-    --watch redraws the status on a terminal; elsewhere every answer is one line, with --json one of JSON.
+    On a terminal, --watch redraws the status in place. Elsewhere it prints one line per update, or one JSON
+    object per line with --json.
 
     Example: [bold]acquire status --wait sealed --timeout 30s[/], or [bold]acquire status --watch[/]
     """
@@ -217,20 +228,17 @@ def status(
 
         watch_status(socket, every, as_json=json)
     elif wait is None:
-        _show_now(socket, json)
-
-
-def _show_now(socket: Path | None, json: bool) -> None:
-    """At once where a daemon of this version answers; the client has patience and words for the rest."""
-    try:
-        show_document(status_document(socket), json)
-    except NO_ANSWER:
-        with _daemon(socket) as daemon:
-            show(daemon.status(), json)
+        # A daemon of this version answers at once. The client, which is slower to import, handles the rest:
+        # it waits for a daemon that is starting, and explains failures.
+        try:
+            show_document(status_document(socket), json)
+        except NO_ANSWER:
+            with _daemon(socket) as daemon:
+                show(daemon.status(), json)
 
 
 def _daemon(socket: Path | None) -> Client:
-    from acquire.cli.progress import teller
+    from acquire.cli.progress import waiting_printer
     from acquire.client import Client
 
-    return Client(socket, teller())
+    return Client(socket, waiting_printer())

@@ -1,4 +1,4 @@
-"""``acquire devices``: the triggers and cameras of a rig, or of this host, and what each lacks."""
+"""``acquire devices``: list the triggers and cameras of a rig, or of this host, and any problem with them."""
 
 from __future__ import annotations
 
@@ -14,7 +14,6 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator
 
     from acquire.camera.base import CameraOpener
-    from acquire.rig import Rig
 
 Row = dict[str, Any]
 COLUMNS = ("device", "serial", "model", "firmware", "state")
@@ -33,15 +32,16 @@ def devices(
             "-c",
             metavar="FILE",
             autocompletion=rigs,
-            help="Rig file whose devices are opened; absent: all that this host shows.",
+            help="Rig file whose devices are opened. Default: list all devices of this host.",
         ),
     ] = None,
     json: JsonFlag = False,
 ) -> None:
-    """List triggers and cameras with their serial numbers, and say what each lacks.
+    """List triggers and cameras with their serial numbers, and report any problem with them.
 
-    With a rig file its devices are opened and set, one after the other, and closed again. Without one
-    the host's serial ports, triggers on USB and cameras are listed; nothing is opened, nothing is sent.
+    With a rig file, its devices are opened and configured one after the other, and closed again. Without one,
+    the serial ports, USB triggers and cameras of the host are listed; no device is opened, and nothing is
+    sent.
 
     Example: [bold]acquire devices --config rig-demo[/]
     """
@@ -52,8 +52,11 @@ def devices(
     print_table(COLUMNS, [[row[column] for column in COLUMNS] for row in rows])
 
 
-def of_rig(config: str) -> Iterator[dict[str, Any]]:
-    """Trigger and cameras of a rig file, opened one after the other; what each lacks. Raises ConfigError."""
+def of_rig(config: str) -> Iterator[Row]:
+    """Open the trigger and the cameras of a rig file one after the other; yield the state of each.
+
+    Raises ConfigError for the rig file.
+    """
     from acquire.camera.look import facts
     from acquire.camera.visit import visit
     from acquire.config import load_rig
@@ -61,8 +64,22 @@ def of_rig(config: str) -> Iterator[dict[str, Any]]:
 
     rig_config = load_rig(config)
     with Rig(rig_config) as rig:
-        yield _trigger(rig)
-        openers = _openers(rig)
+        row = {"device": "trigger", "serial": "", "model": "", "firmware": ""}
+        try:
+            found = rig.trigger.identify()
+            yield row | {
+                "serial": found.serial,
+                "model": found.model,
+                "firmware": found.firmware,
+                "state": "ready",
+            }
+        except AcquireError as error:
+            yield row | {"state": str(error)}
+        openers: dict[str, CameraOpener] | AcquireError
+        try:
+            openers = rig.openers()
+        except AcquireError as error:
+            openers = error  # reported with each camera
         for arm in ("a", "b"):
             camera = rig_config.cameras.arm(arm)
             row = {"device": f"camera {arm}", "serial": camera.serial, "model": camera.model, "firmware": ""}
@@ -75,77 +92,42 @@ def of_rig(config: str) -> Iterator[dict[str, Any]]:
                 yield row | {"state": str(error)}
 
 
-def _openers(rig: Rig) -> dict[str, CameraOpener] | AcquireError:
-    try:
-        return rig.openers()
-    except AcquireError as error:
-        return error
-
-
-def _trigger(rig: Rig) -> dict[str, Any]:
-    try:
-        found = rig.trigger.identify()
-    except AcquireError as error:
-        return {"device": "trigger", "serial": "", "model": "", "firmware": "", "state": str(error)}
-    return {
-        "device": "trigger",
-        "serial": found.serial,
-        "model": found.model,
-        "firmware": found.firmware,
-        "state": "ready",
-    }
-
-
 def _of_host() -> Iterator[Row]:
-    yield from _or_why("trigger, serial", _serial_ports)
-    yield from _or_why("trigger, USB", _usb_triggers)
-    yield from _or_why("camera, GenTL", _gentl_cameras)
-    yield from _or_why("camera, Aravis", _aravis_cameras)
-
-
-def _or_why(device: str, look: Callable[[], Iterable[Row]]) -> list[Row]:
-    """The rows of one way to a device, or one that says why there is none."""
-    try:
-        rows = [_row(device) | row for row in look()]
-    except AcquireError as error:
-        return [_row(device) | {"state": str(error)}]
-    return rows or [_row(device) | {"state": "none"}]
-
-
-def _row(device: str) -> Row:
-    return dict.fromkeys(COLUMNS, "") | {"device": device}
-
-
-def _serial_ports() -> Iterator[Row]:
-    """Whether a trigger is behind a port only its answer tells, and others may not like to be asked."""
+    """List the devices of this host, with at least one row for each way to connect them."""
+    from acquire.camera.aravis import list_cameras as aravis_cameras
+    from acquire.camera.harvesters import list_cameras as gentl_cameras
     from acquire.trigger.transports.serial import list_ports
-
-    for port in list_ports():
-        ask = f"to ask what it is: acquire trigger info --url {port.device}"
-        yield {"serial": port.serial_number, "model": port.description, "state": port.held_by or ask}
-
-
-def _usb_triggers() -> Iterator[Row]:
     from acquire.trigger.transports.usb import list_devices
 
-    for found in list_devices():
-        yield {"serial": found.serial, "model": found.name, "state": found.lacks or "ready"}
+    def serial_ports() -> Iterator[Row]:
+        # Only an answer would show whether a trigger is connected, and other devices may not like the
+        # question.
+        for port in list_ports():
+            ask = f"to identify it: acquire trigger info --url {port.device}"
+            yield {"serial": port.serial_number, "model": port.description, "state": port.held_by or ask}
 
+    def usb_triggers() -> Iterator[Row]:
+        for found in list_devices():
+            yield {"serial": found.serial, "model": found.name, "state": found.lacks or "ready"}
 
-def _gentl_cameras() -> Iterator[Row]:
-    from acquire.camera.harvesters import list_cameras
+    def gentl() -> Iterator[Row]:
+        for camera in gentl_cameras():
+            row = {name: getattr(camera, name) for name in ("serial", "model", "firmware")}
+            yield row | {"state": camera.access}
 
-    for camera in list_cameras():
-        yield {
-            "serial": camera.serial,
-            "model": camera.model,
-            "firmware": camera.firmware,
-            "state": camera.access,
-        }
+    def aravis() -> Iterable[Row]:
+        keys = ("serial", "model")
+        return (dict(zip(keys, found, strict=True)) | {"state": "answers"} for found in aravis_cameras())
 
-
-def _aravis_cameras() -> Iterator[Row]:
-    from acquire.camera.aravis import list_cameras
-
-    for serial, model in list_cameras():
-        yield {"serial": serial, "model": model, "state": "answers"}
+    ways: dict[str, Callable[[], Iterable[Row]]] = {
+        "trigger, serial": serial_ports,
+        "trigger, USB": usb_triggers,
+        "camera, GenTL": gentl,
+        "camera, Aravis": aravis,
+    }
+    for device, look in ways.items():
+        empty = dict.fromkeys(COLUMNS, "") | {"device": device}
+        try:
+            yield from [empty | row for row in look()] or [empty | {"state": "none"}]
+        except AcquireError as error:
+            yield empty | {"state": str(error)}

@@ -1,4 +1,4 @@
-"""``acquire diagnose``: is a recording what it says it is?"""
+"""``acquire diagnose``: check the lines of a recording against its own description."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from acquire.recon.diagnosis import Diagnosis
 
 WRONG = 1
-"""Exit code where something is not as the recording says."""
+"""Exit code if the lines contradict the recording's description."""
 
 
 def register(app: typer.Typer) -> None:
@@ -26,25 +26,30 @@ def diagnose(
     recording: PlaceArgument,
     first_line: Annotated[
         int | None,
-        typer.Option(help="Number of the first line, as the trigger counts; absent: in the middle."),
+        typer.Option(
+            help="Number of the first line, as counted by the trigger. Default: lines in the middle."
+        ),
     ] = None,
-    lines: Annotated[int | None, typer.Option(help="Number of lines; absent: some hundreds.")] = None,
+    lines: Annotated[int | None, typer.Option(help="Number of lines. Default: a few hundred.")] = None,
     begin: FromOption = None,
     end: ToOption = None,
     tile: TileOption = None,
     calibration: Annotated[
         str | None,
-        typer.Option(metavar="CAL", help="Calibration NAME.zarr, or none; absent: the recording's own."),
+        typer.Option(
+            metavar="CAL", help="Calibration NAME.zarr, or 'none'. Default: the one in the recording."
+        ),
     ] = None,
     json: JsonFlag = False,
 ) -> None:
-    """Hold a recording's lines against its code, geometry and orientation, and say what is wrong.
+    """Check a recording's lines against its code, geometry and orientation, and report what is wrong.
 
-    Tried are: the code inverted, late or early by sub-steps and lines, or another run's; arms swapped or
-    mirrored; other sub-steps per line; a stuck arm, black level, ambient light, gains, too little light.
-    The table says how much likelier each is than what the recording says (log likelihood), in standard
-    errors, and how many times better the arms agree than under wrong codes. Exit 1 where something is wrong.
-    Behind a fibre one tile speaks: the one that is named, or whose lines show most contrast.
+    The hypotheses are: the code is inverted, shifted by sub-steps or lines, or belongs to another run; the
+    arms are swapped or mirrored; the number of sub-steps per line differs; an arm is stuck; the black level,
+    ambient light or gains are wrong; there is too little light. For each hypothesis the table shows the gain
+    in log likelihood over the recording's description, that gain in standard errors, and how many times
+    better the arms agree than under wrong codes. The exit code is 1 if something is wrong. Behind a fibre one
+    tile is tested: the one given, or the one whose lines have the most contrast.
 
     Example: [bold]acquire diagnose run.zarr[/]
     """
@@ -88,4 +93,4 @@ def _print(found: Diagnosis, first: int, count: int, whose: dict[str, str]) -> N
         )
         for row in found.rows
     ]
-    print_table(("likelier by", "errors", "agreement", "hypothesis"), rows)
+    print_table(("log likelihood", "std errors", "agreement", "hypothesis"), rows)

@@ -1,7 +1,8 @@
-"""``acquire doctor``: what this host lacks for capturing, and what to do about it."""
+"""``acquire doctor``: check whether this host is fit to capture, and advise what to change."""
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -15,7 +16,6 @@ from acquire.errors import AcquireError, DeviceError
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from acquire.config import RigConfig
     from acquire.daemon.doctor import Finding
 
 WORDS = {"good": "good", "warning": "WARNING", "bad": "BAD"}
@@ -33,46 +33,39 @@ def doctor(
             "-c",
             metavar="FILE",
             autocompletion=rigs,
-            help="Rig file: its devices and needs are looked at.",
+            help="Rig file, to also check its devices and requirements. Default: check the host only.",
         ),
     ] = None,
     socket: Annotated[
-        Path | None, typer.Option("--socket", envvar="ACQUIRE_SOCKET", help="The daemon's control socket.")
+        Path | None, typer.Option("--socket", envvar="ACQUIRE_SOCKET", help="Control socket of the daemon.")
     ] = None,
     json: JsonFlag = False,
 ) -> None:
-    """Look at kernel limits, disk, memory, real-time rights, clock, devices, ports and versions.
+    """Check kernel limits, disk, memory, real-time rights, clock, devices, ports and versions.
 
-    Says for each what to do; changes nothing. Devices of the rig are opened, unless a daemon is running.
-    Ends with 5 where something is bad.
+    The command advises what to do about each problem and changes nothing. It opens the devices of the rig,
+    unless a daemon is running. The exit code is 5 if a check fails.
 
     Example: [bold]acquire doctor --config rig-demo[/]
     """
+    from acquire.client import Client
     from acquire.config import load_rig
     from acquire.daemon.doctor import examine
 
     rig = None if config is None else load_rig(config)
-    running = _running(socket, rig)
+    running: str | None = None  # version of the daemon that is running
+    with suppress(AcquireError):
+        running = Client(socket or (rig.control.socket if rig else None)).status().version
     findings = [*examine(rig, running), *(_devices(config) if config and running is None else ())]
     if json:
         print_json([asdict(one) for one in findings])
     else:
-        print_table(("what", "", "found"), [(one.name, WORDS[one.level], one.text) for one in findings])
+        print_table(("check", "", "result"), [(one.name, WORDS[one.level], one.text) for one in findings])
         for one in findings:
             if one.level != "good" and one.todo:
                 say(f"{one.name}: {one.todo}")
     if any(one.level == "bad" for one in findings):
         raise typer.Exit(DeviceError.exit_code)
-
-
-def _running(socket: Path | None, rig: RigConfig | None) -> str | None:
-    """Version of the daemon that listens, if one does."""
-    from acquire.client import Client
-
-    try:
-        return Client(socket or (rig.control.socket if rig else None)).status().version
-    except AcquireError:
-        return None
 
 
 def _devices(config: str) -> Iterator[Finding]:
@@ -84,7 +77,7 @@ def _devices(config: str) -> Iterator[Finding]:
             ready = row["state"] == "ready"
             name = f"{row['model']} {row['serial']} {row['firmware']}".strip()
             text = f"{name or 'it'} is ready" if ready else row["state"]
-            todo = "" if ready else "acquire devices lists what this host shows"
+            todo = "" if ready else "acquire devices lists the devices of this host"
             yield Finding(row["device"], "good" if ready else "bad", text, todo)
     except AcquireError as error:
         yield Finding("devices", "bad", error.message, error.hint)

@@ -1,11 +1,11 @@
-"""The one grammar of times on the command line.
+"""The grammar of durations and moments on the command line.
 
 ::
 
-    duration   5   5s   500ms   300us   2min   1.5h      a bare number is seconds
-    moment     a duration after the first line or frame · UTC as 2026-01-31T12:00:00 · a line as L5000
+    duration   5   5s   500ms   300us   2min   1.5h      a bare number is in seconds
+    moment     a duration after the first line or frame · UTC (2026-01-31T12:00:00) · a line (L5000)
 
-`seconds` is a parser of options; `acquire.cli.stretch` makes lines of moments.
+`seconds` parses the durations of options; `acquire.cli.stretch` converts moments to lines.
 """
 
 from __future__ import annotations
@@ -23,14 +23,16 @@ if TYPE_CHECKING:
 
 UNITS_NS = {"ns": 1, "us": 10**3, "µs": 10**3, "ms": 10**6, "s": 10**9, "": 10**9, "min": 60 * 10**9}
 UNITS_NS["h"] = 60 * UNITS_NS["min"]
-DURATIONS = "2s, 500ms, 300us, 1.5min, 1h, or seconds as a number"
-MOMENTS = f"{DURATIONS}, after the first; UTC as 2026-01-31T12:00:00; or a line as L5000"
+DURATIONS = "2s, 500ms, 300us, 1.5min, 1h, or a number of seconds"
+MOMENTS = (
+    f"{DURATIONS}, after the first line or frame; UTC such as 2026-01-31T12:00:00; or a line such as L5000"
+)
 _FORM = re.compile(r"\s*([0-9.eE+-]*[0-9.])\s*([a-zµ]*)\s*")
 _NS_PER_S = 1e9
 
 
 def duration_ns(text: str) -> float | None:
-    """Nanoseconds of a duration; None for text that is none."""
+    """Parse a duration to nanoseconds; None for other text."""
     found = _FORM.fullmatch(text)
     if found is None or found[2] not in UNITS_NS:
         return None
@@ -42,7 +44,7 @@ def duration_ns(text: str) -> float | None:
 
 
 def parse_duration_ns(text: str) -> int:
-    """``52ms`` in whole nanoseconds. UsageError names what can be written."""
+    """Parse ``52ms`` to whole nanoseconds. Raises UsageError that names the possible forms."""
     value = duration_ns(text)
     if value is None:
         raise UsageError(f"the time {text!r} cannot be read", possible=MOMENTS)
@@ -50,15 +52,15 @@ def parse_duration_ns(text: str) -> int:
 
 
 def seconds(text: str | float) -> float:
-    """Seconds of a duration in words. typer.BadParameter names what can be written."""
+    """Parse a duration to seconds. Raises typer.BadParameter that names the possible forms."""
     value = duration_ns(str(text))
     if value is None:
-        raise typer.BadParameter(f"{text!r} is no duration: {DURATIONS}")
+        raise typer.BadParameter(f"{text!r} is not a duration, such as {DURATIONS}")
     return value / _NS_PER_S
 
 
 def seconds_between(least: float, most: float = math.inf) -> Callable[[str | float], float]:
-    """A parser like `seconds` of durations from ``least`` to ``most`` seconds."""
+    """Return a parser like `seconds` that accepts durations from ``least`` to ``most`` seconds."""
 
     def parse(text: str | float) -> float:
         value = seconds(text)

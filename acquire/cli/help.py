@@ -1,4 +1,4 @@
-"""Help in plain words that fit the terminal: nothing is loaded to draw it, and nothing is cut."""
+"""Help as plain text that fits the terminal: it needs no library and truncates nothing."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from acquire.cli.commands import COMMANDS
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-SUMMARY = "Record and reconstruct with TDI-based compressed video."
+SUMMARY = "Record and reconstruct TDI-based compressed video."
 EXAMPLE = (
     "Example: acquire serve --config rig-demo, then in another terminal: "
     "acquire arm, acquire start --duration 2s"
 )
 OPTIONS = (
-    ("--version", "Print the version and end."),
-    ("-h, --help", "Show this message; after a command, that command's."),
+    ("--version", "Print the version and exit."),
+    ("-h, --help", "Show this help, or after a command the help of that command."),
 )
 WIDEST = 120
 """Longer lines are hard to read."""
@@ -29,12 +29,12 @@ _MARKUP = re.compile(r"\[(bold|/)\]")
 
 
 def columns() -> int:
-    """Of the terminal, as far as lines should go."""
+    """Return the width for help text: that of the terminal, at most `WIDEST`."""
     return min(WIDEST, shutil.get_terminal_size().columns)
 
 
 def overview() -> str:
-    """The commands, by what they are for."""
+    """Return the program's help, with the commands grouped by purpose."""
     lines = ["Usage: acquire COMMAND [OPTIONS]...", "", SUMMARY, "", "Options:", *_rows(OPTIONS)]
     for panel, commands in groupby(COMMANDS, lambda command: command.panel):
         lines += ["", f"{panel}:", *_rows((command.name, command.summary) for command in commands)]
@@ -54,7 +54,7 @@ def _rows(rows: Any) -> Iterator[str]:
 
 
 def make_plain(command: Any) -> None:
-    """Have a command of typer's tell its help in plain words, as wide as the terminal is."""
+    """Make a command and its subcommands print their help as plain text, as wide as the terminal."""
     command.rich_markup_mode = None
     command.context_settings["max_content_width"] = columns()
     for name in ("help", "short_help", "epilog"):

@@ -1,4 +1,4 @@
-"""``acquire import``: lines that other software captured, as a recording."""
+"""``acquire import``: make a recording from lines that other software captured."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from acquire.exchange import Arm, Instrument
 
 DTYPES = {"uint8": "u1", "u8": "u1", "uint16": "<u2", "u16": "<u2", "<u2": "<u2", ">u2": ">u2"}
-"""How bare numbers can be said to be stored → NumPy's name; ``>u2`` has the larger byte first."""
+"""Names for the type of raw binary data → NumPy's name; ``>u2`` is big-endian."""
 
 
 def register(app: typer.Typer) -> None:
@@ -31,63 +31,91 @@ def register(app: typer.Typer) -> None:
 def import_lines(
     files: Annotated[
         list[Path],
-        typer.Argument(metavar="FILE...", help="Arm a's lines, and arm b's: .npy, .h5, .tif, or .raw."),
+        typer.Argument(
+            metavar="FILE...",
+            help="One file for each arm (a, then b), or one file with both: .npy, .h5, .tif or .raw.",
+        ),
     ],
     out: Annotated[str, typer.Option(metavar="RECORDING", help="New recording: NAME.zarr, or a URL.")],
     config: Annotated[
         str | None,
         typer.Option(
-            metavar="RIG", autocompletion=rigs, help="Rig file with geometry, code, trigger and cameras."
+            metavar="RIG",
+            autocompletion=rigs,
+            help="Rig file with the geometry, code, trigger and cameras. The other options override it.",
         ),
     ] = None,
-    stages: Annotated[int | None, typer.Option(help="M, stages of the sensor; pixels of a line.")] = None,
-    substeps: Annotated[int | None, typer.Option(help="S, charge-transfer steps in a line.")] = None,
-    line_rate: Annotated[float | None, typer.Option(metavar="HZ", help="Lines per second.")] = None,
+    stages: Annotated[
+        int | None,
+        typer.Option(help="M, number of stages of the sensor, which is the number of pixels per line."),
+    ] = None,
+    substeps: Annotated[int | None, typer.Option(help="S, number of charge-transfer steps per line.")] = None,
+    line_rate: Annotated[float | None, typer.Option(metavar="HZ", help="Number of lines per second.")] = None,
     code: Annotated[
         str | None,
-        typer.Option(help="prbs:DEGREE:SEED, prbs:DEGREE:0xSTATE, bits:0x…, bits:FILE, constant:1."),
+        typer.Option(
+            help="Exposure code: prbs:DEGREE:SEED, prbs:DEGREE:0xSTATE, bits:0x…, bits:FILE or constant:1."
+        ),
     ] = None,
     code_start: Annotated[
-        int, typer.Option(min=0, help="The code's bit in the first sub-step of line 0.")
+        int, typer.Option(min=0, help="Index of the code bit in the first sub-step of line 0.")
     ] = 0,
     code_repeats: Annotated[
-        bool, typer.Option("--code-repeats", help="Begin the listed bits anew after the last.")
+        bool, typer.Option("--code-repeats", help="The bits of a bits: code repeat after the last one.")
     ] = False,
-    first_line: Annotated[int, typer.Option(min=0, help="Number of the files' first line.")] = 0,
-    lines: Annotated[int | None, typer.Option(help="Number of lines of each arm; absent: all.")] = None,
-    arm: Annotated[str, typer.Option(help="a or b: whose lines a single file has.")] = "a",
-    dtype: Annotated[
-        str | None, typer.Option(help="Type of bare numbers: uint8, uint16, or >u2 (larger byte first).")
+    first_line: Annotated[int, typer.Option(min=0, help="Number of the first line in the files.")] = 0,
+    lines: Annotated[
+        int | None, typer.Option(help="Number of lines of each arm. Default: all lines.")
     ] = None,
-    pixels: Annotated[int | None, typer.Option(help="Pixels of a line, in a file of bare numbers.")] = None,
+    arm: Annotated[str, typer.Option(help="Arm whose lines a single file holds: a or b.")] = "a",
+    dtype: Annotated[
+        str | None, typer.Option(help="Sample type of raw binary files: uint8, uint16, or >u2 (big-endian).")
+    ] = None,
+    pixels: Annotated[int | None, typer.Option(help="Number of pixels per line in raw binary files.")] = None,
     skip_bytes: Annotated[
-        int, typer.Option(help="Bytes before the first line of a file of bare numbers.")
+        int, typer.Option(help="Number of bytes before the first line in raw binary files.")
     ] = 0,
     dataset: Annotated[
-        str | None, typer.Option(metavar="PATH", help="The array inside HDF5 files, as /entry/data/lines.")
+        str | None,
+        typer.Option(
+            metavar="PATH",
+            help="Path of the lines inside HDF5 files, such as /entry/data/lines. Default: the only such "
+            "array.",
+        ),
     ] = None,
     columns_a: Annotated[
-        str | None, typer.Option(metavar="FIRST:END", help="Pixels of a line that are arm a's.")
+        str | None,
+        typer.Option(
+            metavar="FIRST:END", help="Range of pixels in each line that belongs to arm a. Default: all."
+        ),
     ] = None,
     columns_b: Annotated[
         str | None,
-        typer.Option(metavar="FIRST:END", help="Pixels of a line that are arm b's, also of the same file."),
+        typer.Option(
+            metavar="FIRST:END",
+            help="Range of pixels in each line that belongs to arm b, possibly of the same file. Default: "
+            "all.",
+        ),
     ] = None,
     white: Annotated[
         float | None, typer.Option(metavar="DN", help="Value at which a pixel is saturated.")
     ] = None,
     black: Annotated[float | None, typer.Option(metavar="DN", help="Value of a pixel without light.")] = None,
     responsivity: Annotated[
-        float | None, typer.Option(metavar="DN", help="DN per unit of light and sub-step.")
+        float | None, typer.Option(metavar="DN", help="Responsivity in DN per unit of light and sub-step.")
     ] = None,
     start: Annotated[
-        str | None, typer.Option(metavar="UTC", help="UTC at which the first line was read out.")
+        str | None,
+        typer.Option(
+            metavar="UTC", help="UTC at which the first line was read out, such as 2026-01-31T12:00:00.25."
+        ),
     ] = None,
     json: JsonFlag = False,
 ) -> None:
-    """Make a recording of lines that other software captured, to verify, cut and reconstruct it.
+    """Make a recording from lines that other software captured, to verify, cut and reconstruct it.
 
-    The recording says what is not known of such lines: nothing but your word ties them to the code.
+    Only your arguments tie these lines to the exposure code, so the recording states what is not known about
+    them.
 
     Example: [bold]acquire import a.tif b.tif --out run.zarr --config rig.toml[/]
     """
@@ -99,20 +127,23 @@ def import_lines(
             f"{len(files)} files of lines were given", possible="one for each arm, or one with both"
         )
     check_new_place(out)
-    said = {"white_dn": white, "black_level_dn": black, "responsivity_dn": responsivity}
+    options = {"white_dn": white, "black_level_dn": black, "responsivity_dn": responsivity}
     instrument = _instrument(config, stages, substeps, line_rate, code, repeats=code_repeats)
+    start_ns = None if start is None else utc_ns(start)
+    if start is not None and start_ns is None:
+        raise UsageError(f"--start {start!r} is not a time", possible="UTC such as 2026-01-31T12:00:00.25")
     instrument = replace(
         instrument,
         cameras={
-            each: {**instrument.cameras.get(each, {}), **{k: v for k, v in said.items() if v is not None}}
+            each: {**instrument.cameras.get(each, {}), **{k: v for k, v in options.items() if v is not None}}
             for each in ("a", "b")
         },
         code_start=code_start,
         first_line=first_line,
-        start_ns=_utc_ns(start),
+        start_ns=start_ns,
     )
     if dtype is not None and dtype not in DTYPES:
-        raise UsageError(f"--dtype {dtype!r} is not known", possible=", ".join(DTYPES))
+        raise UsageError(f"there is no --dtype {dtype!r}", possible=", ".join(DTYPES))
     layout = Layout(None if dtype is None else DTYPES[dtype], pixels, skip_bytes, dataset)
     columns = {"a": _columns(columns_a), "b": _columns(columns_b)}
     with ExitStack() as held:
@@ -127,16 +158,7 @@ def import_lines(
     say(f"{done.path}: {done.lines} lines of arm{'s' * (len(done.arms) - 1)} {' and '.join(done.arms)}")
     for text in done.unknown:
         print_warning(f"not known: {text}")
-    say(f"  acquire diagnose {done.path} holds the lines against the code")
-
-
-def _utc_ns(text: str | None) -> int | None:
-    if text is None:
-        return None
-    found = utc_ns(text)
-    if found is None:
-        raise UsageError(f"--start {text!r} is no time", possible="UTC as 2026-01-31T12:00:00.25")
-    return found
+    say(f"  to check the lines against the code: acquire diagnose {done.path}")
 
 
 def _columns(text: str | None) -> tuple[int, int] | None:
@@ -144,14 +166,14 @@ def _columns(text: str | None) -> tuple[int, int] | None:
         return None
     found = re.fullmatch(r"(\d+):(\d+)", text)
     if found is None:
-        raise UsageError(f"columns {text!r} cannot be read", possible="FIRST:END, as 0:192")
+        raise UsageError(f"columns {text!r} cannot be read", possible="FIRST:END, such as 0:192")
     return int(found[1]), int(found[2])
 
 
 def _arms(
     held: ExitStack, files: list[Path], layout: Any, columns: dict[str, tuple[int, int] | None], arm: str
 ) -> dict[str, Arm]:
-    """Which file, or which part of one, has the lines of each arm."""
+    """Find the lines of each arm: a file of its own, a range of columns, or one of the arms in a file."""
     from acquire.exchange import Arm, open_lines
 
     if arm not in columns:
@@ -164,7 +186,9 @@ def _arms(
         }
         for file in opened.values():
             if file.arms == 2:
-                raise UsageError(f"{file.path} has two arms, and there is a file for each", possible="one")
+                raise UsageError(
+                    f"{file.path} has two arms, but there is a file for each arm", possible="one arm per file"
+                )
         return {name: Arm(file) for name, file in opened.items()}
     file = held.enter_context(open_lines(files[0], replace(layout, columns=columns[arm])))
     return {arm: Arm(file)} if file.arms == 1 else {"a": Arm(file, 0), "b": Arm(file, 1)}
@@ -179,7 +203,7 @@ def _instrument(
     *,
     repeats: bool,
 ) -> Instrument:
-    """As a rig file says, or the options; these count where both do."""
+    """Build the instrument from the rig file and the options, which override the file."""
     from acquire.exchange import clock_of, parse_code
 
     light = None if code is None else parse_code(code, repeats=repeats)
@@ -189,8 +213,8 @@ def _instrument(
         known = _of_rig(config)
         if known.fibre is not None and (stages, substeps) != (None, None):
             raise UsageError(
-                "--stages and --substeps cannot change a rig whose [fibre] lays out bands of M·S rows",
-                possible="a rig file that says geometry and fibre together",
+                "--stages and --substeps cannot change a rig with [fibre], whose fibre bands have M·S rows",
+                possible="a rig file with matching geometry and fibre",
             )
         found = replace(
             known,
@@ -215,7 +239,7 @@ def _of_options(
         given = {"--stages": stages, "--substeps": substeps, "--line-rate": line_rate, "--code": light}
         absent = ", ".join(name for name, value in given.items() if value is None)
         raise UsageError(
-            f"the lines cannot be read without {absent}",
+            f"the lines cannot be imported without {absent}",
             possible="all of --stages, --substeps, --line-rate and --code, or --config RIG",
         )
     _check_sizes(stages, substeps, line_rate)

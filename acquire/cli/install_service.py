@@ -1,4 +1,4 @@
-"""``acquire install-service``: the daemon as a service of systemd."""
+"""``acquire install-service``: install the daemon as a systemd service."""
 
 from __future__ import annotations
 
@@ -23,31 +23,34 @@ def install_service(
     ],
     user: Annotated[
         bool,
-        typer.Option("--user", help="Make a service of this user, who needs no root; absent: of the host."),
+        typer.Option(
+            "--user", help="Make a service of the current user, without root. Default: a service of the host."
+        ),
     ] = False,
     account: Annotated[
-        str | None, typer.Option(help="User that the host's service runs as; absent: whoever calls this.")
+        str | None,
+        typer.Option(help="Account under which the host's service runs. Default: the current user."),
     ] = None,
     install: Annotated[
-        bool, typer.Option("--install", help="Write the files; absent: they are printed.")
+        bool, typer.Option("--install", help="Write the files. Default: only print them.")
     ] = False,
     directory: Annotated[
         Path | None,
-        typer.Option(
-            metavar="DIR", help="Directory that the files are written to instead, as for a package."
-        ),
+        typer.Option(metavar="DIR", help="Write the files to this directory instead, as for a package."),
     ] = None,
 ) -> None:
-    """Print or write a unit for systemd (ready, watchdog, hardened, restarted) and a udev rule.
+    """Print or write a hardened systemd unit for the daemon and a udev rule.
 
-    The service tells systemd when it is ready and that it lives; killed or hung it comes back, recovers what
-    was being recorded, and does what [service] begin of the rig says. Nothing is started by this command.
+    The daemon tells systemd when it is ready and answers its watchdog. If it is killed or hangs, systemd
+    restarts it; it then recovers an unfinished recording and does what [service] begin in the rig file says.
+    This command starts nothing.
 
     Example: [bold]acquire install-service --config rig-demo --user[/]
     """
     from acquire.config import find, load_rig
     from acquire.daemon.unit import RULES, SOCKET, UDEV, UNIT, Place, unit_text
     from acquire.place import default_socket
+    from acquire.store.refusals import refused
 
     rig = load_rig(config)
     place = Place.of(user=user)
@@ -62,22 +65,19 @@ def install_service(
             for line in text.splitlines():
                 say(line)
         return
-    _write(files)
-    flag = " --user" if user else ""
-    say(f"now: systemctl{flag} daemon-reload && systemctl{flag} enable --now acquire")
-    if not user and rig.control.socket == default_socket():
-        say(f"clients find it with: export ACQUIRE_SOCKET={SOCKET}")
-
-
-def _write(files: dict[Path, str]) -> None:
-    """What is there and another text is not overwritten. Raises UsageError before anything is written."""
-    from acquire.store.refusals import refused
-
+    # check all files before the first is written
     for path, text in files.items():
         if path.exists() and path.read_text(encoding="utf-8", errors="replace") != text:
-            raise UsageError(f"{path} is there, with another text", hint="compare, and remove it first")
+            raise UsageError(
+                f"{path} exists with different contents and is not overwritten",
+                hint="compare the two, and remove the old file first",
+            )
     for path, text in files.items():
         with refused(path, "written"):
             path.parent.mkdir(parents=True, exist_ok=True)
             path.write_text(text, encoding="utf-8")
-        say(f"{path} is written")
+        say(f"wrote {path}")
+    flag = " --user" if user else ""
+    say(f"next: systemctl{flag} daemon-reload && systemctl{flag} enable --now acquire")
+    if not user and rig.control.socket == default_socket():
+        say(f"for clients: export ACQUIRE_SOCKET={SOCKET}")

@@ -1,4 +1,4 @@
-"""Ctrl-C is answered at once, in words: the first one ends in good order, the second one ends now."""
+"""Handling of Ctrl-C: the first one is acknowledged and ends the work properly, the second ends it now."""
 
 from __future__ import annotations
 
@@ -19,20 +19,21 @@ if TYPE_CHECKING:
 
 END_NOW = "acquire-end-now"
 GRACE_S = 3.0
-"""After the second Ctrl-C, for what is half-made to be removed."""
+"""Time after the second Ctrl-C in which unfinished output is removed."""
 SAME_S = 1.0
-"""Interrupts this close together are one Ctrl-C: where a parent of many threads is killed, the kernel sends
-its death signal once for each of them, and some wrappers hand on what the terminal has sent already."""
+"""Interrupts this close together count as one Ctrl-C: when a parent of many threads is killed, the kernel
+sends its death signal once for each thread, and some wrappers forward a signal that the terminal has already
+sent."""
 
 
 class _Presses:
-    """Of Ctrl-C, as a person presses it, whoever answers at the time."""
+    """Counts how often a person has pressed Ctrl-C, whichever handler is installed at the time."""
 
     def __init__(self) -> None:
         self._counted_at = -math.inf
 
     def another(self) -> bool:
-        """Whether this interrupt is another one, not the last one's echo."""
+        """Whether this interrupt is a new one, and not an echo of the last."""
         now = time.monotonic()
         counts = now - self._counted_at >= SAME_S
         if counts:
@@ -44,43 +45,44 @@ _presses = _Presses()
 
 
 @contextmanager
-def first_interrupt_asks(finishing: str) -> Iterator[threading.Event]:
-    """The first Ctrl-C sets the event, by which the work ends with the best so far; the second ends now.
+def stop_on_interrupt(finishing: str) -> Iterator[threading.Event]:
+    """Set the event at the first Ctrl-C, so that the work ends with the best result so far.
 
-    ``finishing`` says what is still done after the first: "finishing what is being solved".
+    The second Ctrl-C ends the program now. ``finishing`` states the work that is still done after the first,
+    such as "finishing the current segment".
     """
-    asked = threading.Event()
+    stop_requested = threading.Event()
 
     def interrupted(_number: int, _frame: object) -> None:
         if not _presses.another():
             return
-        if asked.is_set():
+        if stop_requested.is_set():
             _end_now()
-        asked.set()
-        note(f"{finishing}; Ctrl-C once more to end now")
+        stop_requested.set()
+        note(f"{finishing}; press Ctrl-C again to end now")
 
     with _handled_by(interrupted):
-        yield asked
+        yield stop_requested
 
 
 @contextmanager
-def interrupts_answered() -> Iterator[None]:
-    """The first Ctrl-C raises KeyboardInterrupt and says so, since to end in good order may take its time."""
-    asked = threading.Event()
+def interrupts_handled() -> Iterator[None]:
+    """Acknowledge the first Ctrl-C and raise KeyboardInterrupt; a proper end may take some time."""
+    stop_requested = threading.Event()
 
     def interrupted(_number: int, _frame: object) -> None:
         if not _presses.another():
             return
-        if asked.is_set():
+        if stop_requested.is_set():
             _end_now()
-        asked.set()
-        note("interrupted, ending; Ctrl-C once more to end now")
+        stop_requested.set()
+        note("interrupted, ending; press Ctrl-C again to end now")
         raise KeyboardInterrupt
 
     try:
         with _handled_by(interrupted):
             yield
-    finally:  # all is removed by now
+    finally:  # unfinished output is removed by now, so the process need not be killed any more
         for thread in threading.enumerate():
             if isinstance(thread, threading.Timer) and thread.name == END_NOW:
                 thread.cancel()
@@ -89,7 +91,7 @@ def interrupts_answered() -> Iterator[None]:
 @contextmanager
 def _handled_by(handler: signal._HANDLER) -> Iterator[None]:
     if threading.current_thread() is not threading.main_thread():
-        yield  # a caller in a thread has its own ways to end this
+        yield  # only the main thread can install handlers; other callers stop the work in their own way
         return
     before = signal.signal(signal.SIGINT, handler)
     try:
@@ -99,8 +101,11 @@ def _handled_by(handler: signal._HANDLER) -> Iterator[None]:
 
 
 def _end_now() -> None:
-    """End our processes, and this one: by an exception, so that what is half-made is removed, or without."""
-    processes = sys.modules.get("multiprocessing")  # who has started one has loaded it
+    """Kill our child processes and end this one: by an exception first, so that unfinished output is removed.
+
+    If that takes longer than `GRACE_S`, the process exits without it.
+    """
+    processes = sys.modules.get("multiprocessing")  # it is loaded if any child was started
     for child in processes.active_children() if processes else ():
         child.kill()
     timer = threading.Timer(GRACE_S, os._exit, (EXIT_INTERRUPTED,))

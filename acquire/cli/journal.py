@@ -1,4 +1,4 @@
-"""Stages of a long command: told on stderr as they end, kept for its report."""
+"""Steps of a long command: printed on stderr as they end, and kept for its report."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ if TYPE_CHECKING:
 
 @dataclass
 class Journal:
-    """The stages since ``when``."""
+    """The steps of a command that began at ``when``."""
 
     stages: list[Stage] = field(default_factory=list)
     when: datetime = field(default_factory=lambda: datetime.now(UTC))
 
     @contextmanager
     def stage(self, name: str) -> Iterator[dict[str, str]]:
-        """Times a stage; ``detail`` may be set in the dictionary given."""
+        """Time a step. The caller may set ``detail`` in the dictionary that it gets."""
         from acquire.evaluate.report import Stage
 
         note: dict[str, str] = {}

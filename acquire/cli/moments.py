@@ -1,4 +1,4 @@
-"""Moments inside a recording or a video, on the command line: after its beginning, UTC, or a line's."""
+"""Moments in a recording or a video on the command line: a time after its start, UTC, or a line number."""
 
 from __future__ import annotations
 
@@ -16,19 +16,19 @@ _LINE = re.compile(r"\s*[Ll](\d+)\s*")
 
 
 def line_number(text: str) -> int | None:
-    """5000 of ``L5000``; None for text that names no line."""
+    """Return 5000 for ``L5000``; None for other text."""
     found = _LINE.fullmatch(text)
     return None if found is None else int(found[1])
 
 
 def utc_ns(text: str) -> int | None:
-    """UTC as ISO 8601 writes it, in ns since 1970; None for text that is no such time."""
+    """Parse UTC in ISO 8601 to ns since 1970; None for other text."""
     try:
         moment = None if text.isdigit() else datetime.fromisoformat(text)
     except ValueError:
         return None
     if moment is None:
-        return None  # 20260131 is seconds, as every bare number
+        return None  # 20260131 is a number of seconds, like every bare number
     since = (moment if moment.tzinfo else moment.replace(tzinfo=UTC)) - datetime.fromtimestamp(0, UTC)
     return (since.days * 86_400 + since.seconds) * UNITS_NS["s"] + since.microseconds * UNITS_NS["us"]
 
@@ -36,9 +36,10 @@ def utc_ns(text: str) -> int | None:
 def after_ns(
     text: str | None, begin_ns: Callable[[], int], line_ns: Callable[[int], int] | None = None
 ) -> int | None:
-    """A moment as nanoseconds after ``begin_ns()``, which is asked only where the text is UTC; None of None.
+    """Parse a moment to nanoseconds after the beginning; None stays None.
 
-    ``line_ns`` says how long after the beginning a line is; where there are no lines, it is absent.
+    ``begin_ns()``, the UTC of the beginning, is called only if the text is UTC. ``line_ns`` returns the time
+    of a line after the beginning; it is absent for a video, which has no lines. Raises UsageError.
     """
     if text is None:
         return None
@@ -46,7 +47,8 @@ def after_ns(
     if line is not None:
         if line_ns is None:
             raise UsageError(
-                f"{text} names a line, and a video has frames", possible="52ms after the first, or UTC"
+                f"{text} is a line, but a video has frames",
+                possible="a time after the first frame, such as 52ms, or UTC",
             )
         return line_ns(line)
     moment = utc_ns(text)

@@ -1,7 +1,8 @@
-"""How commands speak: facts on stdout, as text or JSON; errors on stderr.
+"""Output of the commands: results on stdout, as text or JSON; errors and notes on stderr.
 
-Everything that is printed passes through here, where foreign text is made visible: a name or an attribute
-of somebody else's recording can neither forge a line nor send an escape sequence to the terminal.
+Everything that is printed passes through here, where unprintable characters of foreign text are escaped: a
+name or an attribute of somebody else's recording can neither forge a line nor send an escape sequence to the
+terminal.
 """
 
 from __future__ import annotations
@@ -26,23 +27,22 @@ if TYPE_CHECKING:
 
 JsonFlag = Annotated[bool, typer.Option("--json", help="Print JSON instead of text.")]
 
-
 _IN_JSON = re.compile(r"[^ -~\n]")
 
 
 def say(text: str = "", *, err: bool = False) -> None:
-    """One line. What is said on stderr to nobody any more, as to a page that was killed, ends no work."""
+    """Print one line. A closed stderr (as of a web page that was killed) does not end the work."""
     with contextlib.suppress(*(BrokenPipeError,) if err else ()):
         typer.echo(visible(text), err=err)
 
 
 def print_json(value: Any) -> None:
-    """One JSON document; what JSON does not know is written as text."""
+    """Print one JSON document; values of other types are written as text."""
     typer.echo(json_text(value, indent=2))
 
 
 def json_text(value: Any, indent: int | None = None) -> str:
-    """JSON that can be encoded and shown anywhere: what is not printable is ``\\u`` and its number."""
+    """Return JSON that can be encoded and shown anywhere: unprintable characters become ``\\uXXXX``."""
     text = json.dumps(value, indent=indent, default=str, ensure_ascii=False)
     return _IN_JSON.sub(
         lambda found: found[0] if found[0].isprintable() else json.dumps(found[0])[1:-1], text
@@ -50,31 +50,31 @@ def json_text(value: Any, indent: int | None = None) -> str:
 
 
 def print_facts(facts: Mapping[str, Any]) -> None:
-    """`fact_lines`, printed."""
+    """Print `fact_lines`."""
     for line in fact_lines(facts):
         say(line)
 
 
 def fact_lines(facts: Mapping[str, Any]) -> list[str]:
-    """``name  value`` per line, aligned; None is left out, several values stand side by side.
+    """Return ``name  value`` lines, aligned. None is left out; the items of a tuple are joined by commas.
 
-    What is longer than its line (`room`) goes on below itself, by whole words; for other programs a fact
-    stays on one line.
+    On a terminal, values that are longer than the line (`line_width`) are wrapped between words; in a pipe
+    each fact stays on one line.
     """
     shown = {name: value for name, value in facts.items() if value is not None}
     width = max(map(len, shown), default=0)
     return [
         line
         for name, value in shown.items()
-        for line in _wrapped(f"{name:<{width}}  {visible(_words(value))}", width + 2, room())
+        for line in _wrapped(f"{name:<{width}}  {visible(_text_of(value))}", width + 2, line_width())
     ]
 
 
-def room(*, err: bool = False) -> int:
-    """Columns of a line: those of the terminal, or what COLUMNS says for stdout; no limit in a pipe."""
+def line_width(*, err: bool = False) -> int:
+    """Return the width of a line: that of the terminal, or COLUMNS for stdout; unlimited in a pipe."""
     terminal = (sys.stderr if err else sys.stdout).isatty()
-    asked = bool(os.environ.get("COLUMNS")) and not err
-    return shutil.get_terminal_size().columns if terminal or asked else sys.maxsize
+    requested = bool(os.environ.get("COLUMNS")) and not err
+    return shutil.get_terminal_size().columns if terminal or requested else sys.maxsize
 
 
 def _wrapped(text: str, indent: int, columns: int) -> list[str]:
@@ -91,29 +91,29 @@ def _wrapped(text: str, indent: int, columns: int) -> list[str]:
     )
 
 
-def _words(value: Any) -> str:
+def _text_of(value: Any) -> str:
     if isinstance(value, dict):
-        return ", ".join(f"{name} {_words(below)}" for name, below in value.items())
+        return ", ".join(f"{name} {_text_of(below)}" for name, below in value.items())
     if isinstance(value, bool):
         return "yes" if value else "no"
-    return ", ".join(map(_words, value)) if isinstance(value, tuple) else str(value)
+    return ", ".join(map(_text_of, value)) if isinstance(value, tuple) else str(value)
 
 
 def print_table(columns: Iterable[str], rows: Iterable[Iterable[Any]]) -> None:
-    """`table_lines`, printed."""
+    """Print `table_lines`."""
     for line in table_lines(columns, rows):
         say(line)
 
 
 def table_lines(columns: Iterable[str], rows: Iterable[Iterable[Any]]) -> list[str]:
-    """A plain table, aligned; numbers to the right. Never cut: it is read by people and by grep.
+    """Return a plain, aligned table; numbers are right-aligned. Nothing is truncated: grep reads it, too.
 
-    What is wider than the line (`room`) is shown row by row, a cell in a line, and no word is broken.
+    A table that is wider than the line (`line_width`) is shown row by row, with one cell per line.
     """
     cells = [[visible(cell) for cell in row] for row in rows]
     titles = list(columns)
     widths = [max(map(len, column)) for column in zip(titles, *cells, strict=True)]
-    if sum(widths) + 2 * (len(widths) - 1) > room():
+    if sum(widths) + 2 * (len(widths) - 1) > line_width():
         blocks = [fact_lines({t: cell for t, cell in zip(titles, row, strict=True) if cell}) for row in cells]
         return [line for block in blocks for line in ("", *block)][1:]
     right = [bool(cells) and all(row[i][:1].isdigit() for row in cells) for i in range(len(titles))]
@@ -126,13 +126,13 @@ def table_lines(columns: Iterable[str], rows: Iterable[Iterable[Any]]) -> list[s
     ]
 
 
-def json_asked() -> bool:
-    """Whether this command was given ``--json``; also where its words are wrong and were never taken."""
+def json_requested() -> bool:
+    """Whether ``--json`` is on the command line, even if that could not be parsed."""
     return "--json" in sys.argv[1:]
 
 
 def print_error(error: AcquireError, *, as_json: bool) -> None:
-    """What was asked, what is possible, what to try; on stderr. As JSON: one line, ``{"error": {…}}``."""
+    """Print an error to stderr: the message, what is possible, what to try. As JSON: ``{"error": {…}}``."""
     if as_json:
         facts = error.to_dict()
         about = {"kind": facts.pop("error"), **facts}
@@ -144,27 +144,27 @@ def print_error(error: AcquireError, *, as_json: bool) -> None:
         f"  {word}: {text}" for word, text in (("possible", error.possible), ("try", error.hint)) if text
     ]
     for paragraph in paragraphs:
-        for line in _wrapped(visible(paragraph), 4, room(err=True)):
+        for line in _wrapped(visible(paragraph), 4, line_width(err=True)):
             say(line, err=True)
 
 
 def print_warning(text: str) -> None:
-    """What a user should know although the command did what was asked; on stderr."""
+    """Print a warning to stderr: something the user should know although the command succeeded."""
     say(f"acquire: warning: {text}", err=True)
 
 
 def note(text: str) -> None:
-    """What happens meanwhile; on stderr."""
+    """Print to stderr what the command is doing."""
     say(f"acquire: {text}", err=True)
 
 
 def note_json(facts: Any) -> None:
-    """The same for programs: one line of JSON on stderr."""
+    """Print one line of JSON to stderr, for programs."""
     say(json_text(facts), err=True)
 
 
 def quantity(value: float, unit: str) -> str:
-    """``value`` with three significant digits and a metric prefix: 33.3 kHz, 1.2 MB."""
+    """Format ``value`` with three significant digits and a metric prefix: 33.3 kHz, 1.2 MB."""
     for factor, prefix in ((1e12, "T"), (1e9, "G"), (1e6, "M"), (1e3, "k")):
         if abs(value) >= factor:
             return f"{value / factor:.3g} {prefix}{unit}"

@@ -1,4 +1,4 @@
-"""Places on this machine that a command is given: paths, and directories that it makes."""
+"""Paths on this machine: arguments that must not be URLs, and output directories."""
 
 from __future__ import annotations
 
@@ -13,19 +13,20 @@ if TYPE_CHECKING:
 
 
 def local_path(text: str) -> Path:
-    """A path on this machine; UsageError for a URL of anything else."""
+    """Parse a path on this machine. Raises UsageError for a URL of anything else."""
     if "://" in text and not text.startswith("file://"):
         raise UsageError(
-            f"{text} is a URL, and this command changes a recording in place, which a remote store cannot do",
+            f"{text} is a URL, but this command changes a recording in place, which a remote store does not "
+            "allow",
             possible="a path on this machine",
-            hint="the recording where it was made; info, verify, cut, reconstruct and replay take URLs",
+            hint="the recording where it was made; info, verify, cut, reconstruct and replay accept URLs",
         )
     return Path(text.removeprefix("file://"))
 
 
 @contextlib.contextmanager
 def new_directory(path: Path) -> Iterator[None]:
-    """Make the directory that a command fills; it is removed again if nothing has been put in it."""
+    """Create the output directory of a command; it is removed again if the command leaves it empty."""
     from acquire.store.files import check_new_path
 
     check_new_path(path)
@@ -33,5 +34,5 @@ def new_directory(path: Path) -> Iterator[None]:
     try:
         yield
     finally:
-        with contextlib.suppress(OSError):  # it is not empty
+        with contextlib.suppress(OSError):  # raised if it is not empty
             path.rmdir()

@@ -1,4 +1,4 @@
-"""``acquire plugins``: the variants that are installed, whose they are, and what is wrong with them."""
+"""``acquire plugins``: list the installed plug-ins, the packages they come from, and their errors."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ def register(app: typer.Typer) -> None:
 
 
 def plugins(json: JsonFlag = False) -> None:
-    """List every effect, scene, driver, solver and denoiser: its name, who brings it, and whether it works.
+    """List every effect, scene, driver, solver and denoiser, with its package and whether it works.
 
-    Whatever is installed in the same environment can add some (PLUGINS.md). One that cannot be imported is
-    named here with its error and left out everywhere else.
+    Packages installed in the same environment can add plug-ins (PLUGINS.md). A plug-in that cannot be
+    imported is listed here with its error and left out everywhere else.
 
     Example: [bold]acquire plugins[/]
     """
@@ -60,7 +60,7 @@ def _rows() -> list[dict[str, Any]]:
 
 
 def _with_extra(error: str, distribution: str) -> str:
-    """Ours lack nothing but packages of an extra: which one is said."""
+    """Name the extra to install if one of our own plug-ins lacks a package."""
     from acquire.plugins import OURS
 
     missing = _MISSING.search(error) if distribution == OURS else None

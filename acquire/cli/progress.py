@@ -1,7 +1,7 @@
-"""How far long work is: a bar on a terminal; in a pipe, a line every few seconds on stderr.
+"""Progress of long work: a bar on a terminal; in a pipe, a line every few seconds on stderr.
 
-All commands use the same class. Work of less than two seconds says nothing in a pipe. With ``--json`` each
-line is a JSON object, ``{"progress": {…}}``. Work within work is shown in place of what it is part of.
+All commands use the same class. Work of less than two seconds prints nothing in a pipe. With ``--json`` each
+line is a JSON object, ``{"progress": {…}}``. Nested work replaces the display of the work that contains it.
 """
 
 from __future__ import annotations
@@ -11,28 +11,28 @@ import time
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any, Self
 
-from acquire.cli.output import json_asked, note, note_json
+from acquire.cli.output import json_requested, note, note_json
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
     from types import TracebackType
 
 FIRST_S, EVERY_S = 2.0, 5.0
-"""In a pipe: until the first line, and from one to the next."""
+"""Time until the first line in a pipe, and between two lines."""
 ADVISE_S = 60.0
-"""What takes longer than this from now on is said to do so, once, with what would be quicker."""
+"""If the remaining time exceeds this, the quicker alternatives are printed, once."""
 KNOWN_S = 4.0
-"""For so long the rate of work is not trusted for advice: whatever starts is slow."""
+"""Time for which the rate of work is not trusted for that advice, because work starts slowly."""
 
 
 class Progress:
-    """Work under way, from entering the ``with`` block to leaving it.
+    """Work in progress, from entering the ``with`` block to leaving it.
 
-    ``what`` is a participle, as "verifying run.zarr"; ``advice`` says what to choose where this takes too
-    long. One thread calls; another one prints.
+    ``what`` is a participle, such as "verifying run.zarr"; ``advice`` names quicker alternatives. The methods
+    are called from one thread; another thread prints.
     """
 
-    _shown: list[Progress] = []  # noqa: RUF012  # the innermost one is last; of the process, like its stderr
+    _shown: list[Progress] = []  # noqa: RUF012  # one per process, like its stderr; the innermost is last
 
     def __init__(self, what: str, advice: str = "") -> None:
         self._what, self._advice = what, advice
@@ -45,17 +45,22 @@ class Progress:
         self._bar: Any = None
 
     def advance(self, done: float, total: float) -> None:
-        """So much is done, of so much in all."""
+        """Report the amount done and the total amount."""
         with self._lock:
             self._done, self._total = done, total
             if self._first is None and done > 0:
                 self._first = (time.monotonic(), done)
-        self._advise()
+        left = self.left_s
+        known = self._first is not None and time.monotonic() - self._first[0] > KNOWN_S
+        if self._advice and known and left is not None and left > ADVISE_S:
+            advice, self._advice = self._advice, ""
+            if not json_requested():
+                note(f"{self._what} will take about {span(left)}; quicker: {advice}")
         if self._bar is not None:
             self._bar.update(0, completed=done, total=total or None, amount=self.amount)
 
     def doing(self, what: str) -> None:
-        """The work is now this; how much of it there is, is not known."""
+        """Change the description of the work. The amount is unknown from now on."""
         with self._lock:
             self._what, self._done, self._total, self._first = what, 0.0, 0.0, None
         if self._bar is not None:
@@ -67,8 +72,10 @@ class Progress:
 
     @property
     def left_s(self) -> float | None:
-        """At the rate so far; None while that is not known. The first piece, which compiling or a cold disk
-        may delay, is left out as soon as there are others.
+        """Remaining time at the rate so far; None if the rate is unknown.
+
+        The first piece of work may be delayed by compilation or a cold disk, so it is left out of the rate as
+        soon as others are done.
         """
         if self._first is None or not 0 < self._done <= self._total:
             return None
@@ -77,7 +84,7 @@ class Progress:
 
     @property
     def amount(self) -> str:
-        """What is done of how much: 12 of 40."""
+        """Amount done and total: "12 of 40"."""
         if not self._total:
             return ""
         digits = 0 if self._done == int(self._done) else 1
@@ -127,31 +134,20 @@ class Progress:
             return
         while True:
             with self._lock:
-                self._line()
+                left = self.left_s
+                if json_requested():
+                    times = {
+                        "elapsed_s": round(self.elapsed_s, 1),
+                        "left_s": None if left is None else round(left, 1),
+                    }
+                    facts = {"what": self._what, "done": self._done, "total": self._total or None}
+                    note_json({"progress": facts | times})
+                else:
+                    amount = f": {self.amount} ({self._done / self._total:.0%})" if self._total else ""
+                    ahead = "" if left is None else f", about {span(left)} left"
+                    note(f"{self._what}{amount}, {span(self.elapsed_s)}{ahead}")
             if self._over.wait(EVERY_S):
                 return
-
-    def _line(self) -> None:
-        left = self.left_s
-        if json_asked():
-            facts = {"what": self._what, "done": self._done, "total": self._total or None}
-            times = {
-                "elapsed_s": round(self.elapsed_s, 1),
-                "left_s": None if left is None else round(left, 1),
-            }
-            note_json({"progress": facts | times})
-            return
-        share = f" ({self._done / self._total:.0%})" if self._total else ""
-        ahead = "" if left is None else f", about {span(left)} left"
-        note(f"{self._what}{': ' if self.amount else ''}{self.amount}{share}, {span(self.elapsed_s)}{ahead}")
-
-    def _advise(self) -> None:
-        left = self.left_s
-        known = self._first is not None and time.monotonic() - self._first[0] > KNOWN_S
-        if self._advice and known and left is not None and left > ADVISE_S:
-            advice, self._advice = self._advice, ""
-            if not json_asked():
-                note(f"{self._what} will take about {span(left)}; in less time: {advice}")
 
 
 def _bar(console: Any) -> Any:
@@ -170,7 +166,7 @@ def _bar(console: Any) -> Any:
 
 
 def span(seconds: float) -> str:
-    """A duration for people: 8 s, 2 min 30 s, 3 h 20 min."""
+    """Format a duration: 8 s, 2 min 30 s, 3 h 20 min."""
     whole = round(seconds)
     if whole < 60:
         return f"{whole} s"
@@ -181,29 +177,29 @@ def span(seconds: float) -> str:
 
 @contextmanager
 def stage_progress(what: str, advice: str = "") -> Iterator[Callable[[float, float], None]]:
-    """`Progress` of work that says how far it is: the function given takes (done, of how much)."""
+    """Show the progress of work that knows its amount: yield a callback that takes (done, total)."""
     with Progress(what, advice) as progress:
         yield progress.advance
 
 
-def teller() -> Callable[[str], None]:
-    """Prints what a command is waiting for, a line whenever that changes, in a pipe as on a terminal."""
+def waiting_printer() -> Callable[[str], None]:
+    """Return a callback that prints what a command is waiting for, one line whenever that changes."""
     latest = ""
 
-    def tell(what: str) -> None:
+    def print_waiting(what: str) -> None:
         nonlocal latest
         if what != latest:
             latest = what
-            if json_asked():
+            if json_requested():
                 note_json({"waiting": what})
             else:
                 note(f"{what} …")
 
-    return tell
+    return print_waiting
 
 
 @contextmanager
-def told(what: str = "working") -> Iterator[Callable[[str], None]]:
-    """`Progress` of work that says what it does: the function given takes the words."""
+def activity_progress(what: str = "working") -> Iterator[Callable[[str], None]]:
+    """Show the progress of work of unknown amount: yield a callback that takes the current activity."""
     with Progress(what) as progress:
         yield progress.doing

@@ -1,4 +1,4 @@
-"""``acquire reconstruct --explain``: what the parts of a calibration give, and what they cost."""
+"""``acquire reconstruct --explain``: the gain and the cost of each part of a calibration."""
 
 from __future__ import annotations
 
@@ -12,59 +12,57 @@ from acquire.errors import UsageError
 
 if TYPE_CHECKING:
     from acquire.calibrate.choose import Chosen
-    from acquire.cli.reconstruct_request import Asked
-    from acquire.reconstruct.explain import Worth
+    from acquire.cli.reconstruct_request import Arguments
     from acquire.store import Recording
 
 
 def explain_calibration(
-    recording: Recording, chosen: Chosen | None, asked: Asked, *, wanted: bool, json: bool
-) -> bool:
-    """Say what is doubtful about the calibration; and, where that is ``wanted``, try it part by part on lines
-    in the middle of what is asked for, and print a table. Whether it was.
+    recording: Recording, chosen: Chosen | None, arguments: Arguments, *, wanted: bool, json: bool
+) -> None:
+    """Warn about doubts in the calibration. If ``wanted``, also leave out its parts in turn and print a
+    table.
+
+    The parts are tried on lines in the middle of the selected range.
     """
-    for doubt in () if chosen is None else chosen.doubts:
-        print_warning(doubt)
-    if wanted:
-        _explain(recording, chosen, asked, json=json)
-    return wanted
-
-
-def _explain(recording: Recording, chosen: Chosen | None, asked: Asked, *, json: bool) -> None:
     from acquire.cores import idle_cores, limit_blas
     from acquire.reconstruct.explain import MOST_LINES, explain
     from acquire.reconstruct.liveliest import representative_tile
 
+    for doubt in () if chosen is None else chosen.doubts:
+        print_warning(doubt)
+    if not wanted:
+        return
     if chosen is None:
         raise UsageError(
             f"{recording} carries no calibration to be explained",
             possible="--calibration NAME.zarr",
-            hint="acquire calibrate, which makes one",
+            hint="acquire calibrate, to make one",
         )
-    voxels = parse_voxels(asked.voxels[0])
-    first = recording.first_available_line if asked.first_line is None else asked.first_line
-    lines = recording.first_line + recording.lines - first if asked.lines is None else asked.lines
+    voxels = parse_voxels(arguments.voxels[0])
+    first = recording.first_available_line if arguments.first_line is None else arguments.first_line
+    lines = recording.first_line + recording.lines - first if arguments.lines is None else arguments.lines
     count = min(lines, MOST_LINES)
     middle = (first + (lines - count) // 2, count)
-    tile = representative_tile(recording, asked.tiles, middle, chosen.calibration)
+    tile = representative_tile(recording, arguments.tiles, middle, chosen.calibration)
     segment = recording.cut(*middle, tile)
     with (
-        stage_progress("leaving out one part of the calibration after the other") as advance,
+        stage_progress("leaving out the parts of the calibration in turn") as advance,
         limit_blas(idle_cores()),
     ):
         found = explain(segment, chosen.calibration, voxels.spatial_merge, voxels.temporal_merge, advance)
     if json:
-        whose = {} if tile is None else {"tile": str(tile)}
+        tile_facts = {} if tile is None else {"tile": str(tile)}
         parts = [asdict(worth) for worth in found]
-        print_json({"calibration": chosen.origin, **whose, "parts": parts})
+        print_json({"calibration": chosen.origin, **tile_facts, "parts": parts})
         return
-    which = f"{count} lines from line {segment.first_line} on" + ("" if tile is None else f" of tile {tile}")
+    which = f"{count} lines from line {segment.first_line}" + ("" if tile is None else f" of tile {tile}")
     say(f"calibration: {chosen.origin}; {which}, voxels {voxels}")
-    print_table(("corrected", "unseen samples missed by", "gives (dB)", "time"), map(_row, found))
-
-
-def _row(worth: Worth) -> tuple[str, str, str, str]:
-    if worth.gain_db is None or worth.time_factor is None:
-        return worth.part, f"{worth.prediction:.2%}", "", f"{worth.seconds:.1f} s"
-    name, missed = f"all but {worth.part}", f"{worth.prediction:.2%}"
-    return name, missed, f"{worth.gain_db:+.1f}", f"x {worth.time_factor:.2f}"
+    rows = []
+    for worth in found:
+        error = f"{worth.prediction:.2%}"
+        if worth.gain_db is None or worth.time_factor is None:  # with all parts, or without any
+            rows.append((worth.part, error, "", f"{worth.seconds:.1f} s"))
+        else:
+            gain, factor = f"{worth.gain_db:+.1f}", f"x {worth.time_factor:.2f}"
+            rows.append((f"all but {worth.part}", error, gain, factor))
+    print_table(("corrected", "held-out error", "gain (dB)", "time"), rows)

@@ -1,4 +1,4 @@
-"""What ``acquire reconstruct`` was asked for, in words, as requests that can be carried out."""
+"""Turns the arguments of ``acquire reconstruct`` into requests for videos."""
 
 from __future__ import annotations
 
@@ -37,20 +37,20 @@ if TYPE_CHECKING:
 
 PREVIEW_ITERATIONS = 8
 PREVIEW_BANDWIDTH = 0.5
-"""Of its frames' Nyquist frequency: to find out would take longer than the preview."""
+"""Share of the frames' Nyquist frequency; a search for the best one would take longer than the preview."""
 PREVIEW_MERGE = 4
 PREVIEW_LINES = 320
-"""More than these are not looked at one after the other, but in glimpses."""
+"""A longer range is previewed in glimpses, spread over the range."""
 PREVIEW_SIDE = 16
-"""Voxels of a tile of a scene behind a fibre, along either side."""
+"""Voxels along each side of a tile behind a fibre."""
 GLIMPSES = 12
 GLIMPSE_MERGE = 16
 ENDS = {None: None, "trusted": False, "whole": True}
 
 
 @dataclass(frozen=True, slots=True)
-class Asked:
-    """The options of the command, as given."""
+class Arguments:
+    """The arguments of the command, as given."""
 
     first_line: int | None
     lines: int | None
@@ -70,8 +70,10 @@ class Asked:
 
 @dataclass(frozen=True, slots=True)
 class Prepared:
-    """A request for each video, by what is added to its name; the plan where there is one; ``learned`` says
-    why the preset was preferred.
+    """A request for each video, by the suffix of its name.
+
+    ``plan`` is set if the range was divided by a plan; ``learned`` explains a preset that was chosen from
+    past results.
     """
 
     requests: dict[str, VideoRequest]
@@ -80,65 +82,66 @@ class Prepared:
     learned: str = ""
 
 
-def prepare(recording: Recording, asked: Asked) -> Prepared:
-    """What is to be done. UsageError and ConfigError for what cannot be."""
-    prepared = _requests(recording, asked)
-    requests = {name: in_tiles(request, asked.tiles) for name, request in prepared.requests.items()}
+def prepare(recording: Recording, arguments: Arguments) -> Prepared:
+    """Return the requests and the options to carry them out with. Raises UsageError and ConfigError."""
+    prepared = _requests(recording, arguments)
+    requests = {name: in_tiles(request, arguments.tiles) for name, request in prepared.requests.items()}
     prepared = replace(prepared, requests=requests)
-    if asked.preview:
+    if arguments.preview:
         return prepared
-    learned = Choice(asked.preset, "") if asked.preset else _learned(prepared)
-    options = replace(prepared.options, preset=learned.preset or prepared.options.preset)  # type: ignore[arg-type]  # checked where it is used
-    return replace(prepared, options=options, learned=learned.why)
 
-
-def _learned(prepared: Prepared) -> Choice:
-    """The preset that gets furthest in the budget, as `acquire tradeoff` found out, or why there is none."""
+    # With a time limit and no preset given, prefer the preset that `acquire tradeoff` found best.
     options = prepared.options
     known = [each for each in recall() if each.solver == options.solver]
-    if options.budget_s is None or not known:
-        return Choice(None, "")
-    grids = [request.grid for request in prepared.requests.values()]
-    tiles = max(1, *(len(request.tiles) for request in prepared.requests.values()))
-    return choose(known, options.budget_s, tiles * sum(grid.frames * grid.side**2 for grid in grids))
+    if arguments.preset:
+        choice = Choice(arguments.preset, "")
+    elif options.budget_s is None or not known:
+        choice = Choice(None, "")
+    else:
+        grids = [request.grid for request in requests.values()]
+        tiles = max(1, *(len(request.tiles) for request in requests.values()))
+        choice = choose(known, options.budget_s, tiles * sum(grid.frames * grid.side**2 for grid in grids))
+    options = replace(options, preset=choice.preset or options.preset)  # type: ignore[arg-type]  # checked when it is used
+    return replace(prepared, options=options, learned=choice.why)
 
 
-def _requests(recording: Recording, asked: Asked) -> Prepared:
-    if asked.ends not in ENDS:
-        raise UsageError(f"--ends {asked.ends} is not known", possible="trusted, whole")
-    if (asked.plan is not None) + bool(asked.segments) + asked.auto + asked.preview > 1:
+def _requests(recording: Recording, arguments: Arguments) -> Prepared:
+    if arguments.ends not in ENDS:
+        raise UsageError(f"there is no --ends {arguments.ends}", possible="trusted, whole")
+    if (arguments.plan is not None) + bool(arguments.segments) + arguments.auto + arguments.preview > 1:
         raise UsageError("--plan, --segment, --auto and --preview exclude each other", possible="one of them")
-    selection, whole = _select(recording, asked), ENDS[asked.ends]
-    if asked.preview:
+    selection, whole = _select(recording, arguments), ENDS[arguments.ends]
+    if arguments.preview:
         options = replace(
-            asked.options,
+            arguments.options,
             iterations=PREVIEW_ITERATIONS,
             bandwidth=PREVIEW_BANDWIDTH,
             check=False,
             error=False,
         )
-        return Prepared({"": _preview(selection, len(asked.tiles), whole=whole)}, options)
-    plan = _plan(recording, selection, asked)
+        return Prepared({"": _preview(selection, len(arguments.tiles), whole=whole)}, options)
+    plan = _plan(recording, selection, arguments)
     if plan is not None:
-        if asked.save_plan is not None:
-            _write_plan(asked.save_plan, plan)
-        return Prepared({"": along_plan(selection, plan)}, asked.options, plan)
-    kinds = [parse_voxels(text) for text in asked.voxels]
+        if arguments.save_plan is not None:
+            _write_plan(arguments.save_plan, plan)
+        return Prepared({"": along_plan(selection, plan)}, arguments.options, plan)
+    kinds = [parse_voxels(text) for text in arguments.voxels]
     requests = [in_voxels(selection, kind, whole_ends=whole) for kind in kinds]
     names = [str(kind) if len(kinds) > 1 else "" for kind in kinds]
-    return Prepared(dict(zip(names, requests, strict=True)), asked.options)
+    return Prepared(dict(zip(names, requests, strict=True)), arguments.options)
 
 
 def parse_voxels(text: str) -> Voxels:
-    """``3x4`` is N_m = 3, T_m = 4."""
+    """Parse a voxel size: ``3x4`` is N_m = 3, T_m = 4."""
     found = re.fullmatch(r"(\d+)[x×](\d+)", text)
     if found is None:
-        raise UsageError(f"voxels {text!r} cannot be read", possible="NMxTM, as 3x1 or 1x820")
+        raise UsageError(f"the voxel size {text!r} cannot be read", possible="NMxTM, such as 3x1 or 1x820")
     return Voxels(int(found[1]), int(found[2]))
 
 
 def parse_segment(text: str) -> dict[str, float]:
-    """``712:3x4`` are lines, ``1.1ms:1x230`` a time, ``:3x4`` the rest; as a plan file's table."""
+    """Parse a sub-segment to a table of a plan file: by lines, ``712:3x4``, by time, ``1.1ms:1x230``, or the
+    rest, ``:3x4``."""
     length, _, kind = text.rpartition(":")
     voxels = parse_voxels(kind)
     table: dict[str, float] = {
@@ -152,32 +155,32 @@ def parse_segment(text: str) -> dict[str, float]:
     return table
 
 
-def _select(recording: Recording, asked: Asked) -> Selection:
-    timed = asked.begin is not None or asked.end is not None
-    if not timed:
-        return by_lines(recording, asked.first_line, asked.lines)
-    if asked.first_line is not None or asked.lines is not None:
-        return by_lines(
-            recording, *lines_between(recording, asked.first_line, asked.lines, asked.begin, asked.end)
+def _select(recording: Recording, arguments: Arguments) -> Selection:
+    first, count, begin, end = arguments.first_line, arguments.lines, arguments.begin, arguments.end
+    if begin is None and end is None:
+        return by_lines(recording, first, count)
+    if first is not None or count is not None:
+        return by_lines(recording, *lines_between(recording, first, count, begin, end))
+    # two times select the frames between them, which is not the same as selecting the lines
+    begin_ns, end_ns = (
+        after_ns(
+            text,
+            lambda: first_ns(recording),
+            lambda line: round((line - recording.first_line) * recording.line_period_ns),
         )
-    return by_time(recording, _after_ns(recording, asked.begin), _after_ns(recording, asked.end))
-
-
-def _after_ns(recording: Recording, text: str | None) -> int | None:
-    """A time as nanoseconds after the read-out of the recording's first line begins."""
-    return after_ns(
-        text,
-        lambda: first_ns(recording),
-        lambda line: round((line - recording.first_line) * recording.line_period_ns),
+        for text in (begin, end)
     )
+    return by_time(recording, begin_ns, end_ns)
 
 
 def _preview(selection: Selection, tiles: int, *, whole: bool | None) -> VideoRequest:
-    """The whole of a selection in a second or two, however long it is: coarse, or glimpses of it."""
+    """Request a preview that takes a second or two, however long the range: coarse, or glimpses of it."""
     stream = selection.stream
     size = stream.geometry(1).size
     side = min(2 * stream.substeps, size)
-    if tiles:  # a scene of so many is seen from farther away, in voxels that fill each
+    if (
+        tiles
+    ):  # a scene of many tiles is shown coarser: `PREVIEW_SIDE` voxels or more along each side of a tile
         side = max(merge for merge in range(1, max(1, size // PREVIEW_SIDE) + 1) if not size % merge)
     begin, end = selection.extent(Voxels(1, 1), Voxels(1, 1), whole=False)
     lines = stream.sub_segment(Stretch(begin, end, Voxels(1, 1))).lines
@@ -187,33 +190,33 @@ def _preview(selection: Selection, tiles: int, *, whole: bool | None) -> VideoRe
     return in_voxels(selection, Voxels(side, PREVIEW_MERGE), whole_ends=whole, longest=1 << 62)
 
 
-def _plan(recording: Recording, selection: Selection, asked: Asked) -> ReconstructionPlan | None:
-    if asked.auto:
+def _plan(recording: Recording, selection: Selection, arguments: Arguments) -> ReconstructionPlan | None:
+    if arguments.auto:
         from acquire.reconstruct.propose import propose
 
-        # threads of BLAS that wait for a core that others use cost five times the time
+        # BLAS threads that wait for a busy core would make this take five times as long
         with (
-            stage_progress("looking for what changes", "--from and --to, for a part") as advance,
+            stage_progress("looking for changes in the scene", "--from and --to, for a part") as advance,
             limit_blas(idle_cores()),
         ):
             return propose(
                 recording,
                 selection,
-                whole=asked.ends == "whole",
+                whole=arguments.ends == "whole",
                 progress=advance,
-                calibration=asked.options.calibration,
-                tiles=asked.tiles,
+                calibration=arguments.options.calibration,
+                tiles=arguments.tiles,
             )
-    if asked.plan is not None:
-        return load_plan(asked.plan)
-    if not asked.segments:
+    if arguments.plan is not None:
+        return load_plan(arguments.plan)
+    if not arguments.segments:
         return None
-    ends = {} if asked.ends is None else {"ends": asked.ends}
-    return check_plan({"segments": [parse_segment(text) for text in asked.segments], **ends}, "--segment")
+    ends = {} if arguments.ends is None else {"ends": arguments.ends}
+    return check_plan({"segments": [parse_segment(text) for text in arguments.segments], **ends}, "--segment")
 
 
 def _write_plan(path: Path, plan: ReconstructionPlan) -> None:
-    """As TOML, whose strings and numbers are JSON's."""
+    """Write a plan as TOML, in which strings and numbers look the same as in JSON."""
     check_new_path(path)
     text = [f"{key} = {json.dumps(value)}" for key, value in plan.model_dump(exclude={"segments"}).items()]
     for part in plan.segments:

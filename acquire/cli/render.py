@@ -1,4 +1,4 @@
-"""``acquire render``: videos for people, from reconstructed ones."""
+"""``acquire render``: turn reconstructed videos into movies, animations, stills or a page."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from acquire.cli.output import JsonFlag, print_json, quantity, say
 from acquire.cli.progress import stage_progress
 from acquire.errors import UsageError
 
-SHEET_FRAMES = 12
-MOVIE_FRAMES = 300
+SHEET_FRAMES, MOVIE_FRAMES = 12, 300
+SHEET_HEIGHT, MOVIE_HEIGHT = 192, 384
 
 
 def register(app: typer.Typer) -> None:
@@ -23,29 +23,39 @@ def register(app: typer.Typer) -> None:
 def render(
     video: Annotated[
         list[str],
-        typer.Argument(metavar="VIDEO...", help="Videos, by path or URL; several are shown side by side."),
+        typer.Argument(metavar="VIDEO...", help="Videos, by path or URL. Several are shown side by side."),
     ],
     out: Annotated[
         Path,
         typer.Option(
-            metavar="FILE", help="New file: .mp4, .gif, .webp, .png (a sheet of frames), .html (a page)."
+            metavar="FILE",
+            help="New file. Its suffix sets the format: .mp4, .gif, .webp, .png (a sheet of frames) or .html "
+            "(a page).",
         ),
     ],
     frames: Annotated[
         int | None,
-        typer.Option(help=f"Largest number of frames; absent: {MOVIE_FRAMES}, on a sheet {SHEET_FRAMES}."),
+        typer.Option(
+            help=f"Maximum number of frames. Default: {MOVIE_FRAMES}, or {SHEET_FRAMES} on a sheet."
+        ),
     ] = None,
-    fps: Annotated[float, typer.Option(help="Frames that are shown per second.")] = 25.0,
-    height: Annotated[int | None, typer.Option(metavar="PIXELS", help="Height of a panel.")] = None,
+    fps: Annotated[float, typer.Option(help="Frames shown per second.")] = 25.0,
+    height: Annotated[
+        int | None,
+        typer.Option(
+            metavar="PIXELS",
+            help=f"Height of each video in pixels. Default: {MOVIE_HEIGHT}, or {SHEET_HEIGHT} on a sheet.",
+        ),
+    ] = None,
     peak: Annotated[
-        float | None, typer.Option(help="Value that is shown white; absent: nearly the brightest.")
+        float | None, typer.Option(help="Value shown as white. Default: close to the brightest value.")
     ] = None,
     json: JsonFlag = False,
 ) -> None:
-    """Make a movie, an animation, a sheet of stills or a page of reconstructed videos.
+    """Turn reconstructed videos into a movie, an animation, a sheet of stills or a page.
 
-    A page has a player that pauses and steps, what of the lines each frame leaves unexplained, and an account
-    of every sub-segment.
+    A page has a player with single steps, the residual of every frame over time, and the facts of every
+    sub-segment.
 
     Example: [bold]acquire render fish-1x820.zarr fish-3x4.zarr --out fish.mp4[/]
     """
@@ -56,8 +66,15 @@ def render(
 
     sheet = out.suffix.lower() == ".png"
     count = frames if frames is not None else SHEET_FRAMES if sheet else MOVIE_FRAMES
-    look = Look(height or (192 if sheet else 384), peak, fps)
-    _check(count, look.panel_px, fps, peak)
+    look = Look(height or (SHEET_HEIGHT if sheet else MOVIE_HEIGHT), peak, fps)
+    for name, value, low, high in (
+        ("--frames", count, 1, 100_000),
+        ("--height", look.panel_px, 16, 4096),
+        ("--fps", fps, 0.1, 240),
+        ("--peak", 1.0 if peak is None else peak, 1e-30, 1e30),
+    ):
+        if not low <= value <= high:
+            raise UsageError(f"{name} {value} is out of range", possible=f"{low} to {high}")
     check_suffix(out)
     check_new_path(out)
     panels = [Panel(PurePosixPath(place).stem, open_video(place)) for place in video]
@@ -74,14 +91,3 @@ def render(
         print_json({"path": str(out), "frames": shown, "bytes": size})
     else:
         say(f"{out}: {shown} frames, {quantity(size, 'B')}")
-
-
-def _check(count: int, height: int, fps: float, peak: float | None) -> None:
-    for name, value, low, high in (
-        ("--frames", count, 1, 100_000),
-        ("--height", height, 16, 4096),
-        ("--fps", fps, 0.1, 240),
-        ("--peak", 1.0 if peak is None else peak, 1e-30, 1e30),
-    ):
-        if not low <= value <= high:
-            raise UsageError(f"{name} {value} is out of range", possible=f"{low} to {high}")

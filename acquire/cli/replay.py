@@ -1,4 +1,4 @@
-"""``acquire replay``: a stored stream goes through the simulated devices into a daemon again."""
+"""``acquire replay``: feed a recording through the simulated devices into a daemon again."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ if TYPE_CHECKING:
     from acquire.store.reader import Recording
 
 FASTEST = 32.0
-"""What ``--speed 0`` begins with: a trigger of some MHz keeps a process busy with nothing but its tags."""
+"""First speed tried by ``--speed 0``: at a few MHz, the trigger's tags alone keep a process busy."""
 SLOWER, TRIES = 4.0, 4
-"""Where lines of a recording that no ring can hold are lost: by how much slower it is tried, how often."""
+"""If lines are lost because the ring cannot hold the recording, each attempt is slower by this factor."""
 LONGEST_SOCKET = 90
-"""Bytes of a socket's path that every system takes."""
+"""Longest path of a socket (bytes) that every system accepts."""
 
 
 def register(app: typer.Typer) -> None:
@@ -38,28 +38,32 @@ def replay(
     out: Annotated[
         Path | None,
         typer.Option(
-            metavar="FILE", help="New recording of the replay; absent: a daemon waits for commands."
+            metavar="FILE",
+            help="Record the replay in this new recording. Default: run a daemon that waits for commands.",
         ),
     ] = None,
     speed: Annotated[
-        float, typer.Option(help="Simulated seconds per second; 0: as fast as no line is lost.")
+        float,
+        typer.Option(help="Speed relative to real time, or 0 for the highest speed without lost lines."),
     ] = 1.0,
-    loop: Annotated[bool, typer.Option(help="Replay over and over, for a daemon under load.")] = False,
+    loop: Annotated[bool, typer.Option(help="Replay endlessly, to put a daemon under load.")] = False,
     socket: Annotated[
         Path | None,
-        typer.Option(envvar="ACQUIRE_SOCKET", help="Control socket, without --out; else the user's."),
+        typer.Option(
+            envvar="ACQUIRE_SOCKET", help="Control socket, without --out. Default: the user's usual one."
+        ),
     ] = None,
     json: JsonFlag = False,
 ) -> None:
-    """Feed a recording through the simulated devices into a daemon; the lines come out identical.
+    """Feed a recording through the simulated devices into a daemon again. The lines come out identical.
 
-    With --out the daemon lives for one recording, on a socket of its own, and every array of that recording
-    is compared with the first: exit code 0 where all are equal, 6 where one differs, 2 where the recording
-    cannot be replayed. Gaps stay gaps, and flags come back as they were recorded: the light's code is not
-    judged anew, since when a verdict comes depends on the load. A recording that is too large for the memory
-    is tried again more slowly when lines are lost.
+    With --out, a daemon makes one recording, on a socket of its own, and every array of it is compared with
+    the original. The exit code is 0 if all are equal, 6 if one differs, and 2 if the recording cannot be
+    replayed. Gaps stay gaps, and flags are replayed as recorded; the exposure code is not checked again,
+    because the time of such a verdict depends on the load. If lines are lost because the recording does not
+    fit into memory, the replay is repeated at a lower speed.
 
-    Without --out the daemon runs until Ctrl-C and is armed and started like any other.
+    Without --out, the daemon runs until Ctrl-C and is armed and started like any other.
 
     Example: [bold]acquire replay run.zarr --out again.zarr --speed 0[/]
     """
@@ -67,14 +71,14 @@ def replay(
 
     if not 0 <= speed <= 1000:
         raise UsageError(
-            f"--speed {speed:g} is out of range", possible="0 for as fast as it goes, or up to 1000"
+            f"--speed {speed:g} is out of range", possible="0 for the highest possible speed, or up to 1000"
         )
     if out is not None:
         if loop:
             raise UsageError("--loop with --out would never end", possible="one of them")
         check_new_path(out)
-    with _at_hand(recording) as stored:
-        if out is None:  # the daemon in this process, until it is told to end
+    with _local_recording(recording) as stored:
+        if out is None:  # run the daemon in this process until it is stopped
             from acquire.cli.replay_rig import replay_rig
             from acquire.cli.serve import serve
 
@@ -82,7 +86,7 @@ def replay(
                 table = replay_rig(stored, speed or 1.0, Path.cwd(), replay_loop=loop)
                 serve(str(_rig_file(directory, table)), socket, None)
             return
-        used, differences = _until_nothing_is_lost(stored, out, speed or FASTEST)
+        used, differences = _replay_without_loss(stored, out, speed or FASTEST)
         facts = {
             "path": str(out),
             "lines": stored.lines,
@@ -100,8 +104,11 @@ def replay(
 
 
 @contextmanager
-def _at_hand(place: str) -> Iterator[Recording]:
-    """The recording, fetched to this machine where it is far away: cameras cannot wait for a network."""
+def _local_recording(place: str) -> Iterator[Recording]:
+    """Open a recording; a remote one is downloaded first, because cameras cannot wait for a network.
+
+    Raises UsageError if it cannot be replayed.
+    """
     from acquire.store import open_recording
     from acquire.store.remote import RemoteSource
 
@@ -109,20 +116,20 @@ def _at_hand(place: str) -> Iterator[Recording]:
     with ExitStack() as held:
         stored = open_recording(place)
         if not stored.lines:
-            raise UsageError(f"{place} cannot be replayed: it holds no lines")
+            raise UsageError(f"{place} cannot be replayed: it has no lines")
         if stored.state != "sealed":
             raise UsageError(
                 f"{place} cannot be replayed: it is not sealed",
-                hint=f"acquire stop where it is being written, or acquire recover {place}",
+                hint=f"acquire stop, if it is being written, or acquire recover {place}",
             )
         if isinstance(stored.source, RemoteSource):
             directory = Path(held.enter_context(tempfile.TemporaryDirectory(prefix="acquire-")))
-            stored = open_recording(_fetched(stored.source, directory / place.rpartition("/")[2]))
+            stored = open_recording(_download(stored.source, directory / place.rpartition("/")[2]))
         yield stored
 
 
-def _fetched(source: Any, path: Path) -> Path:
-    """A copy of all parts of a recording below ``path``."""
+def _download(source: Any, path: Path) -> Path:
+    """Copy all files of a remote recording below ``path``."""
     from acquire.store.refusals import refused
 
     with refused(source, "read"):
@@ -130,11 +137,11 @@ def _fetched(source: Any, path: Path) -> Path:
     room, size = shutil.disk_usage(path.parent).free, sum(sizes.values())
     if size > room:
         raise UsageError(
-            f"{source} cannot be fetched: it has {size} bytes, and {path.parent} has room for {room}",
+            f"{source} cannot be downloaded: it has {size} bytes, but {path.parent} has room for {room}",
             hint="TMPDIR on a larger disk",
         )
     done = 0
-    with stage_progress(f"fetching {path.name}") as advance:
+    with stage_progress(f"downloading {path.name}") as advance:
         for key, part_size in sizes.items():
             target = path / key
             target.parent.mkdir(parents=True, exist_ok=True)
@@ -146,8 +153,8 @@ def _fetched(source: Any, path: Path) -> Path:
     return path
 
 
-def _until_nothing_is_lost(stored: Recording, out: Path, speed: float) -> tuple[float, list[Difference]]:
-    """The speed at which nothing was lost, and what differs; slower and slower where lines are lost."""
+def _replay_without_loss(stored: Recording, out: Path, speed: float) -> tuple[float, list[Difference]]:
+    """Replay at lower and lower speeds until no lines are lost; return that speed and the differences."""
     from acquire.store import open_recording
     from acquire.store.compare import compare
 
@@ -159,7 +166,7 @@ def _until_nothing_is_lost(stored: Recording, out: Path, speed: float) -> tuple[
                 return pace, compare(stored, open_recording(out), advance)
         if last:
             break
-        shutil.rmtree(out, ignore_errors=True)  # made by `_record`, of a name that was free
+        shutil.rmtree(out, ignore_errors=True)  # it did not exist before `_record` made it
     raise AcquireError(
         f"the replay to {out} lost lines at every speed that was tried, down to {pace:g}: {fault}",
         hint="fewer other processes on this host, or more memory, so that the ring can hold the recording",
@@ -167,48 +174,51 @@ def _until_nothing_is_lost(stored: Recording, out: Path, speed: float) -> tuple[
 
 
 def _record(stored: Recording, out: Path, speed: float) -> str | None:
-    """One attempt; what was lost on the way, None where nothing was."""
+    """Replay once; return the reason why lines were lost, None if none were."""
     from acquire.cli.demo.capture import await_daemon, daemon_process, follow
     from acquire.cli.replay_rig import replay_rig
     from acquire.client import Client
+    from acquire.store import open_recording
 
     with ExitStack() as held:
         directory = held.enter_context(_private_directory())
         gate, socket, log = (directory / name for name in ("gate", "c.sock", "daemon.log"))
         table = replay_rig(stored, speed, directory, replay_gate=str(gate))
-        table["check"] = {"enable": False}  # flags are replayed, and when a verdict comes depends on the load
+        table["check"] = {
+            "enable": False
+        }  # flags are replayed; the time of a new verdict depends on the load
         table["recording"]["after"] = "idle"
-        # A process of its own: the daemon's signals and threads are not for this one.
+        # A process of its own, because the daemon installs signal handlers and starts threads.
         options = [f"--config={_rig_file(directory, table)}", f"--socket={socket}"]
         process = held.enter_context(daemon_process(options, log))
         client = held.enter_context(Client(socket))
         advance = held.enter_context(stage_progress(f"replaying {out.name}"))
         await_daemon(client, process, log)
-        client.arm(force=True)  # the ring holds what the disk does not take in time
+        client.arm(
+            force=True
+        )  # even if the disk is too slow: the ring holds the lines until they are written
         client.start(out.absolute(), lines=stored.lines)
-        gate.touch()  # no line comes before, so that none can come before the recording has begun
+        gate.touch()  # lets the cameras deliver lines, now that the recording has begun
         status = follow(client, stored.lines, advance)
     if status.fault:
         return status.fault
     last = status.last
     if last is None or last.lines < stored.lines:
-        return "none was made" if last is None else f"it ended after {last.lines} lines: {last.end_reason}"
-    return "the rings were full" if any(_lost_more(stored, out)) else None
-
-
-def _lost_more(stored: Recording, out: Path) -> Iterator[bool]:
-    """Whether more lines of an arm are missing than there were."""
-    from acquire.store import open_recording
-
-    again = open_recording(out)
-    for arm in again.arms:
-        before = sum(map(len, stored.lost_rows(arm))) + sum(map(len, stored.dropped_rows()))
-        yield sum(map(len, again.lost_rows(arm))) > before
+        return (
+            "no recording was made"
+            if last is None
+            else f"the recording ended after {last.lines} lines: {last.end_reason}"
+        )
+    again, dropped = open_recording(out), sum(map(len, stored.dropped_rows()))
+    for arm in again.arms:  # are more lines missing than in the original?
+        if sum(map(len, again.lost_rows(arm))) > sum(map(len, stored.lost_rows(arm))) + dropped:
+            return "the rings were full"
+    return None
 
 
 @contextmanager
 def _private_directory() -> Iterator[Path]:
-    """A directory of our own for socket, rig and log, with a path that is short enough for a socket."""
+    """Make a temporary directory for socket, rig and log, with a path that is short enough for a socket."""
     with ExitStack() as held:
         name = held.enter_context(tempfile.TemporaryDirectory(prefix="acquire-"))
         if len(f"{name}/c.sock".encode()) > LONGEST_SOCKET:

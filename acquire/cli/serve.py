@@ -1,4 +1,4 @@
-"""``acquire serve``: the daemon in the foreground."""
+"""``acquire serve``: run the daemon in the foreground."""
 
 from __future__ import annotations
 
@@ -25,29 +25,32 @@ def serve(
             "-c",
             metavar="FILE",
             autocompletion=rigs,
-            help="Rig file, or the name of a built-in one.",
+            help="Rig file, or the name of a built-in rig.",
         ),
     ],
     socket: Annotated[
         Path | None,
-        typer.Option(envvar="ACQUIRE_SOCKET", help="Control socket; absent: the one in the configuration."),
+        typer.Option(
+            envvar="ACQUIRE_SOCKET", help="Control socket to listen on. Default: the one in the rig file."
+        ),
     ] = None,
     settings: Annotated[
         list[str] | None,
         typer.Option(
             "--set",
             metavar="KEY=VALUE",
-            help="Change one value of the rig file, e.g. code.seed=7; repeatable.",
+            help="Override one value of the rig file, such as code.seed=7. Repeatable.",
         ),
     ] = None,
     owned: Annotated[
         bool, typer.Option("--owned", hidden=True, help="End as on SIGTERM when standard input is closed.")
     ] = False,
 ) -> None:
-    """Own the rig's devices and take commands, until SIGTERM or Ctrl-C.
+    """Run the daemon that controls the rig's devices and takes commands, until SIGTERM or Ctrl-C.
 
-    A recording under way is drained and sealed first; a second Ctrl-C seals what there is at once. Where no
-    terminal is its own, SIGHUP has it read the file anew, as `acquire reload` does.
+    A recording in progress is drained and sealed first; a second Ctrl-C seals the lines received so far at
+    once. Unless the daemon runs in a terminal, SIGHUP makes it read the rig file again, as `acquire reload`
+    does.
 
     Example: [bold]acquire serve --config rig-demo[/]
     """
@@ -80,7 +83,7 @@ def serve(
 
 
 def end_with_owner() -> None:
-    """The other end of standard input is closed by its owner's end, also by a kill."""
+    """End this process when its owner ends, even by a kill: that closes the other end of standard input."""
     import os
     import signal
 

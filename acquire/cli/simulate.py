@@ -1,4 +1,4 @@
-"""``acquire simulate``: a scene, a picture or a video becomes a recording; what its effects are worth."""
+"""``acquire simulate``: record a scene, a picture or a video, and show which of its effects matter."""
 
 from __future__ import annotations
 
@@ -15,7 +15,6 @@ from acquire.cli.progress import stage_progress
 from acquire.errors import UsageError
 
 if TYPE_CHECKING:
-    from acquire.config import RigConfig
     from acquire.simulate import Study, Worth
 
 
@@ -26,9 +25,15 @@ def register(app: typer.Typer) -> None:
 def simulate(
     scene: Annotated[
         str,
-        typer.Argument(metavar="SCENE", autocompletion=scenes, help="Scene file; picture, video or .npy."),
+        typer.Argument(
+            metavar="SCENE",
+            autocompletion=scenes,
+            help="Scene file, the name of a built-in scene, a picture, a video or a .npy file.",
+        ),
     ],
-    out: Annotated[Path | None, typer.Option(metavar="FILE", help="New recording, NAME.zarr.")] = None,
+    out: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="New recording NAME.zarr. Required without --explain.")
+    ] = None,
     config: Annotated[
         str | None,
         typer.Option(
@@ -36,25 +41,31 @@ def simulate(
             "-c",
             metavar="RIG",
             autocompletion=rigs,
-            help="Rig file, or the name of a built-in one; absent: the scene's.",
+            help="Rig file, or the name of a built-in rig. Default: the one named in the scene file.",
         ),
     ] = None,
-    lines: Annotated[int | None, typer.Option(help="Number of lines; absent: the scene's.")] = None,
+    lines: Annotated[
+        int | None, typer.Option(help="Number of lines. Default: the number in the scene file.")
+    ] = None,
     duration: Annotated[
         float | None,
-        typer.Option(
-            parser=seconds, metavar="TIME", help="Length of the recording, in the place of --lines."
-        ),
+        typer.Option(parser=seconds, metavar="TIME", help="Duration of the recording, instead of --lines."),
     ] = None,
     settings: Annotated[
         list[str] | None,
-        typer.Option("--set", metavar="KEY=VALUE", help="Change one value of the rig, e.g. code.seed=7."),
+        typer.Option(
+            "--set",
+            metavar="KEY=VALUE",
+            help="Override one value of the rig file, such as code.seed=7. Repeatable.",
+        ),
     ] = None,
-    explain: Annotated[bool, typer.Option(help="Only show the pipeline and the cost of each stage.")] = False,
-    advice: Annotated[bool, typer.Option(help="Say which of the scene's effects matter.")] = True,
+    explain: Annotated[
+        bool, typer.Option(help="Only show the simulated effects and the cost of each; record nothing.")
+    ] = False,
+    advice: Annotated[bool, typer.Option(help="Show which of the scene's effects matter.")] = True,
     json: JsonFlag = False,
 ) -> None:
-    """Write a recording of a simulated scene as fast as it goes; no daemon needed.
+    """Record a simulated scene as fast as possible, without a daemon.
 
     Example: [bold]acquire simulate scene-digits --out digits.zarr[/]
     """
@@ -66,12 +77,18 @@ def simulate(
 
     if out is None and not explain:
         raise UsageError(
-            "simulate needs --out, where the recording goes", possible="--out NAME.zarr, or --explain"
+            "simulate needs --out, the recording to write", possible="--out NAME.zarr, or --explain"
         )
-    limit_blas(1)  # the arms share the cores
+    limit_blas(1)  # both arms compute at the same time
     shown = load_scene(scene)
     rig = load_rig(config or shown.rig, parse_settings(settings or []), scene)
-    count = _line_count(rig, shown.lines, lines, duration)
+    count = shown.lines if lines is None else lines
+    if duration is not None:
+        if lines is not None:
+            raise UsageError("--lines and --duration exclude each other", possible="one of them")
+        if not duration > 0:
+            raise UsageError(f"--duration {duration} is out of range", possible="more than 0")
+        count = max(1, round(duration * rig.line_rate_hz))
     facts: dict[str, Any] = {}
     if out is not None and not explain:
         check_new_path(out)
@@ -80,7 +97,7 @@ def simulate(
         facts = {**asdict(done), "path": str(done.path), "speed": done.speed}
     found = None
     if explain or (advice and shown.effects):
-        with stage_progress("leaving out one effect after the other"):
+        with stage_progress("leaving out the effects in turn"):
             found = study(bench_of(rig, shown), rig.code.build())
     if json:
         print_json({**facts, "study": found and asdict(found)})
@@ -99,16 +116,6 @@ def simulate(
         _print_study(found, explain=explain)
 
 
-def _line_count(rig: RigConfig, default: int, lines: int | None, duration: float | None) -> int:
-    if lines is not None and duration is not None:
-        raise UsageError("--lines and --duration exclude each other", possible="one of them")
-    if duration is not None:
-        if not duration > 0:
-            raise UsageError(f"--duration {duration} is out of range", possible="more than 0")
-        return max(1, round(duration * rig.line_rate_hz))
-    return default if lines is None else lines
-
-
 def _print_study(found: Study, *, explain: bool) -> None:
     say()
     if explain:
@@ -123,13 +130,13 @@ def _print_study(found: Study, *, explain: bool) -> None:
     if found.effects:
         by_size = sorted(found.effects, key=lambda worth: -(worth.noises or 0))
         changes = [(w.effect, f"{w.change_dn:.3g}", f"{w.noises or 0:.3g}", verdict(w)) for w in by_size]
-        print_table(("left out", "lines change by DN", "noises", "so"), changes)
+        print_table(("left out", "change (DN)", "change (noise)", "verdict"), changes)
 
 
 def verdict(worth: Worth) -> str:
-    """What an effect's size means for the scene."""
+    """State what the size of an effect means for the scene."""
     if worth.noises is None:
-        return "lines are lost, and known to be"
+        return "loses lines, which are flagged"
     if worth.noises < 0.05:
-        return f"can be left out, saves {worth.us_per_line:.2f} us a line"
-    return "small beside the noise" if worth.noises < 0.5 else "matters"
+        return f"can be left out, saves {worth.us_per_line:.2f} us per line"
+    return "small relative to the noise" if worth.noises < 0.5 else "matters"

@@ -1,4 +1,4 @@
-"""Tiles of a scene behind a fibre, as they are named on the command line."""
+"""The options that select tiles of a scene behind a fibre."""
 
 from __future__ import annotations
 
@@ -15,46 +15,55 @@ if TYPE_CHECKING:
 
 TileOption = Annotated[
     str | None,
-    typer.Option("--tile", metavar="ROW,COLUMN", help="Tile of a scene behind a fibre, counted from 0,0."),
+    typer.Option(
+        "--tile", metavar="ROW,COLUMN", help="For a scene behind a fibre: the tile to use, counted from 0,0."
+    ),
 ]
 TilesOption = Annotated[
     str | None,
     typer.Option(
         "--tiles",
         metavar="ROWS,COLUMNS",
-        help="Tiles of a scene behind a fibre, counted from 0: 1,2 is one, 0-1,2-4 are six; absent: all.",
+        help="For a scene behind a fibre: the tiles to use, counted from 0. 1,2 is one tile, 0-1,2-4 are "
+        "six. Default: all tiles.",
     ),
 ]
 
 
 def tile_of(recording: Recording, text: str | None) -> Tile | None:
-    """The one tile that is named; None for none. UsageError for several, and for one that is not there."""
+    """Return the selected tile, None without one. Raises UsageError for several tiles, or one outside."""
     if text is None:
         return None
     tiles = tiles_of(recording, text)
     if len(tiles) > 1:
-        raise UsageError(f"--tile takes one tile, and {text} is {len(tiles)}", possible=f"one, as {tiles[0]}")
+        raise UsageError(
+            f"--tile takes one tile, but {text} selects {len(tiles)}",
+            possible=f"one tile, such as {tiles[0]}",
+        )
     return tiles[0]
 
 
 def tiles_of(recording: Recording, text: str | None) -> tuple[Tile, ...]:
-    """The tiles of a rectangle, row by row; all of a recording where none is named, none without a fibre.
+    """Return the selected tiles, row by row; all tiles of the recording if ``text`` is None.
 
-    Raises UsageError for what cannot be read, tiles that are not there, and a recording without a fibre.
+    A recording without a fibre has none. Raises UsageError for text that cannot be read, for tiles outside
+    the scene, and for tiles of a recording without a fibre.
     """
     from acquire.fibre import Tile
 
     fibre: Fibre | None = recording.fibre
     if fibre is None:
         if text is not None:
-            raise UsageError(f"{recording} has no tiles: its lines see one scene", possible="no --tiles")
+            raise UsageError(
+                f"{recording} has no tiles, because it was not recorded behind a fibre", possible="no --tiles"
+            )
         return ()
     if text is None:
         return fibre.tiles
     found = re.fullmatch(r"(\d+)(?:-(\d+))?,(\d+)(?:-(\d+))?", text)
     if found is None:
         raise UsageError(
-            f"tiles {text!r} cannot be read", possible="ROWS,COLUMNS from 0 on, as 1,2 or 0-1,2-4"
+            f"the tiles {text!r} cannot be read", possible="ROWS,COLUMNS from 0, such as 1,2 or 0-1,2-4"
         )
     top, bottom, left, right = (None if each is None else int(each) for each in found.groups())
     last = Tile(top if bottom is None else bottom, left if right is None else right)  # type: ignore[arg-type]  # digits
@@ -68,6 +77,7 @@ def tiles_of(recording: Recording, text: str | None) -> tuple[Tile, ...]:
     )
     if not tiles:
         raise UsageError(
-            f"the range of tiles {text!r} runs backwards", possible="the smaller number first, as 0-1,2-4"
+            f"the range of tiles {text!r} runs backwards",
+            possible="the smaller number first, such as 0-1,2-4",
         )
     return tiles

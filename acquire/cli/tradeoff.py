@@ -1,4 +1,4 @@
-"""``acquire tradeoff``: what accuracy costs in time, and what `--budget` learns from it."""
+"""``acquire tradeoff``: measure accuracy against time, and let `reconstruct --budget` learn from it."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ import typer
 from acquire.cli.durations import seconds
 from acquire.cli.output import JsonFlag, print_json, print_table, say
 from acquire.cli.places import new_directory
-from acquire.cli.progress import stage_progress, told
+from acquire.cli.progress import activity_progress, stage_progress
 from acquire.cli.tiles import TileOption, tile_of
 from acquire.errors import UsageError
 
@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 
 LINES, FIRST_LINE = 263, 200
 APART = 67
-"""Lines from one repeat to the next."""
+"""Distance between two repeats, in lines."""
 LONGEST_S = 60.0
 
 
@@ -45,49 +45,61 @@ def tradeoff(
         list[str],
         typer.Argument(
             metavar="SCENE|RECORDING",
-            help="Scene files, recordings (NAME.zarr), or procedural scenes: splash, bullet, flame …",
+            help="Scene files, recordings (NAME.zarr), or procedural scenes such as splash, bullet and "
+            "flame.",
         ),
     ],
-    out: Annotated[Path, typer.Option(metavar="DIR", help="New directory.")] = Path("acquire-tradeoff"),
+    out: Annotated[
+        Path, typer.Option(metavar="DIR", help="New directory for the page and all its data.")
+    ] = Path("acquire-tradeoff"),
     full_well: Annotated[
         list[str] | None,
         typer.Option(
             metavar="ELECTRONS",
-            help="Electrons at the brightest of procedural scenes, or clean; repeatable; absent: 1e4.",
+            help="Electrons in the brightest sample of procedural scenes, or 'clean' (no noise). Repeatable. "
+            "Default: 1e4.",
         ),
     ] = None,
     voxels: Annotated[
         list[str] | None,
-        typer.Option(metavar="NMxTM", help="Voxels to reconstruct, N_m x T_m; repeatable; absent: 3x1."),
+        typer.Option(metavar="NMxTM", help="Voxel size to try, N_m x T_m. Repeatable. Default: 3x1."),
     ] = None,
     solver: Annotated[
-        list[str] | None, typer.Option(help="Solver to try; repeatable; absent: every one.")
+        list[str] | None, typer.Option(help="Solver to try. Repeatable. Default: all solvers.")
     ] = None,
     preset: Annotated[
-        list[str] | None, typer.Option(help="Preset to try; repeatable; absent: fast and balanced.")
+        list[str] | None, typer.Option(help="Preset to try. Repeatable. Default: fast and balanced.")
     ] = None,
     dtype: Annotated[
-        list[str] | None, typer.Option(help="float32 or float64; repeatable; absent: float32.")
+        list[str] | None,
+        typer.Option(help="Floating-point type to try, float32 or float64. Repeatable. Default: float32."),
     ] = None,
     repeats: Annotated[
-        int, typer.Option(min=1, max=20, help="Runs of each kind, which give the band of the curves.")
+        int, typer.Option(min=1, max=20, help="Number of runs of each kind, for the bands of the curves.")
     ] = 3,
     first_line: Annotated[
-        int | None, typer.Option(help="Number of the segment's first line; absent: chosen.")
+        int | None,
+        typer.Option(
+            help="Number of the first line to use. Default: chosen near the start of the recording."
+        ),
     ] = None,
-    lines: Annotated[int, typer.Option(help="Number of lines of the segment, L_R.")] = LINES,
+    lines: Annotated[int, typer.Option(help="L_R, number of lines to reconstruct.")] = LINES,
     budget: Annotated[
-        float, typer.Option(parser=seconds, metavar="TIME", help="Longest run; what it cuts short is marked.")
+        float,
+        typer.Option(
+            parser=seconds, metavar="TIME", help="Time limit for each run. Runs that reach it are marked."
+        ),
     ] = LONGEST_S,
     tile: TileOption = None,
     learn: Annotated[
-        bool, typer.Option(help="Let `acquire reconstruct --budget` prefer the best preset.")
+        bool,
+        typer.Option(help="Save the results, so that `acquire reconstruct --budget` picks the best preset."),
     ] = True,
     json: JsonFlag = False,
 ) -> None:
-    """Draw accuracy against wall and processor time for every solver, preset and kind of voxels, on one page.
+    """Plot accuracy against wall and processor time for solvers, presets and voxel sizes, on one page.
 
-    Behind a fibre one tile speaks: the one that is named, or whose lines show most change.
+    Behind a fibre one tile is used: the one given, or the one whose lines change most.
 
     Example: [bold]acquire tradeoff scene-leds splash bullet --full-well clean --full-well 1e4[/]
     """
@@ -101,22 +113,25 @@ def tradeoff(
     from acquire.reconstruct.learned import remember
 
     kinds = tuple(parse_voxels(text) for text in voxels or ["3x1"])
-    asked = list(
+    combinations = list(
         itertools.product(solver or SOLVERS.working(), preset or ("fast", "balanced"), dtype or ("float32",))
     )
-    for each, kind, exact in asked:
-        preset_iterations(each, kind)
-        open_arrays("cpu", exact)
+    for solver_name, preset_name, dtype_name in combinations:  # raises for unknown names
+        preset_iterations(solver_name, preset_name)
+        open_arrays("cpu", dtype_name)
     if not budget > 0:
         raise UsageError(f"a budget of {budget:g} s is out of range", possible="more than 0")
     with new_directory(out):
         cases, effects = _cases(sources, out, full_well or [], (first_line, lines, repeats), tile)
         host = HostWatch()
-        runs, truths = _measure(cases, repeats, kinds, asked=asked, longest_s=budget, host=host)
+        runs, truths = _measure(cases, repeats, kinds, combinations=combinations, longest_s=budget, host=host)
+        differences = dict.fromkeys(case.repeats for case in cases)
         heading = {
             "title": ", ".join(Path(source).stem for source in sources),
             "command": f"acquire {shlex.join(sys.argv[1:])}",
-            "notes": _notes(cases, repeats),
+            "notes": [f"{repeats} repeats: {each}." for each in differences]
+            if repeats > 1
+            else ["One run of each kind."],
             "host": host.busyness().facts(),
         }
         page = write_page(runs, truths, effects, directory=out, heading=heading, when=datetime.now(UTC))
@@ -135,20 +150,19 @@ def _measure(
     cases: list[Case],
     repeats: int,
     kinds: tuple[Voxels, ...],
-    asked: list[tuple[str, str, str]],
+    combinations: list[tuple[str, str, str]],
     longest_s: float,
     host: HostWatch,
 ) -> tuple[list[Run], dict[tuple[str, Voxels], Any]]:
-    """Every run, and the true frames beside those that are shown."""
+    """Measure every combination of solver, preset and dtype; return the runs and the true frames to show."""
     from acquire.cores import idle_cores, limit_threads
     from acquire.evaluate.tradeoff import measure
 
     runs, truths = [], {}
     for case, repeat in itertools.product(cases, range(repeats)):
-        with told() as tell:
-            tell(f"preparing {case.name}")
+        with activity_progress(f"preparing {case.name}"):
             judge = case.judge(repeat)
-        for voxels, (solver, preset, exact) in itertools.product(kinds, asked):
+        for voxels, (solver, preset, dtype) in itertools.product(kinds, combinations):
             host.look()
             what = f"{case.name}: {solver} {preset} {voxels}, {repeat + 1} of {repeats}"
             with stage_progress(what) as advance, limit_threads(idle_cores()):
@@ -156,10 +170,10 @@ def _measure(
                     judge,
                     solver,
                     voxels,
-                    preset=preset,  # type: ignore[arg-type]  # checked before
+                    preset=preset,  # type: ignore[arg-type]  # checked in `tradeoff`
                     longest_s=longest_s,
                     progress=advance,
-                    dtype=exact,  # type: ignore[arg-type]
+                    dtype=dtype,  # type: ignore[arg-type]  # checked in `tradeoff`
                 )
             runs.append(replace(run, case=case.name, repeat=repeat))
             if repeat == 0:
@@ -169,24 +183,22 @@ def _measure(
     return runs, truths
 
 
-def _notes(cases: list[Case], repeats: int) -> list[str]:
-    differ = dict.fromkeys(case.repeats for case in cases)
-    return [f"{repeats} repeats: {each}." for each in differ] if repeats > 1 else ["One run of each kind."]
-
-
 def _cases(
     sources: list[str],
     out: Path,
     full_well: list[str],
-    asked: tuple[int | None, int, int],
+    extent: tuple[int | None, int, int],
     tile: str | None,
 ) -> tuple[list[Case], Study | None]:
-    """What is measured on; what the effects of the first scene that has any are worth."""
-    from acquire.evaluate.cases import full_wells, of_recording, procedural
+    """Return the cases to measure, and the study of the effects of the first scene that has any.
+
+    ``extent`` is the first line, the number of lines and the number of repeats.
+    """
+    from acquire.evaluate.cases import full_wells, procedural, recording_case
     from acquire.reconstruct.liveliest import representative_tile
     from acquire.sim.procedural import SCENES
 
-    (first_line, lines, repeats), cases, effects = asked, [], None
+    (first_line, lines, repeats), cases, effects = extent, [], None
     wells = full_wells(full_well or ["1e4"])
     for source in dict.fromkeys(sources):
         if source in SCENES:
@@ -198,45 +210,43 @@ def _cases(
         first = first_line
         if first is None:  # not the very beginning, if there is room
             first = recording.first_line + max(0, min(FIRST_LINE, recording.lines - lines))
-        named = tile_of(recording, tile)
-        seen = representative_tile(recording, () if named is None else (named,), (first, lines))
-        # lines that are not there are refused before anything is measured
-        recording.cut(first, lines, seen)
-        cases.append(of_recording(Path(source).stem, recording, first, lines, APART, seen))
+        given = tile_of(recording, tile)
+        used = representative_tile(recording, () if given is None else (given,), (first, lines))
+        recording.cut(first, lines, used)  # raises for missing lines, before anything is measured
+        cases.append(recording_case(Path(source).stem, recording, first, lines, APART, used))
     return cases, effects
 
 
 def _opened(source: str, out: Path, lines: int) -> tuple[Recording, Study | None]:
-    """The recording, made where a scene is given; what the scene's effects are worth."""
+    """Open a recording, or record a scene; in the latter case also study the scene's effects."""
     from acquire.config import load_rig, load_scene
     from acquire.simulate import bench_of, simulate, study
     from acquire.store import open_recording
 
-    if "://" in source or os.path.isdir(source):  # noqa: PTH112  # Path's raises for an impossible name
+    if "://" in source or os.path.isdir(source):  # noqa: PTH112  # Path.is_dir raises for an impossible name
         recording = open_recording(source)
         return recording, None
     scene, place = load_scene(source), out / f"{Path(source).stem}.zarr"
     rig = load_rig(scene.rig)
-    with told() as tell:
-        tell(f"recording {source}")
+    with activity_progress(f"recording {source}") as report:
         simulate(rig, scene, place, lines)
         if not scene.effects:
             return open_recording(place), None
-        tell("leaving out one effect after the other")
+        report("leaving out the effects in turn")
         return open_recording(place), study(bench_of(rig, scene), rig.code.build())
 
 
 def _lessons(runs: list[Run]) -> list[Learned]:
-    """What the repeats reached that ended by themselves: one that was cut says nothing of its preset."""
+    """Return the median results of each kind of run. Runs cut by the time limit do not judge their preset."""
     from acquire.evaluate.tradeoff_figures import in_series
     from acquire.reconstruct.learned import Learned
 
     lessons = []
     for case, voxels in dict.fromkeys((run.case, run.voxels) for run in runs):
         own = [run for run in runs if (run.case, run.voxels) == (case, voxels)]
-        for (solver, preset, exact), repeats in in_series(own).items():
+        for (solver, preset, dtype), repeats in in_series(own).items():
             reached = [run.end.psnr_db for run in repeats if run.end.psnr_db is not None]
-            if exact != "float32" or not reached or any(run.cut for run in repeats):
+            if dtype != "float32" or not reached or any(run.cut for run in repeats):
                 continue
             seconds = median(run.end.seconds for run in repeats)
             merges, count = (voxels.spatial_merge, voxels.temporal_merge), repeats[0].voxel_count
@@ -245,7 +255,7 @@ def _lessons(runs: list[Run]) -> list[Learned]:
 
 
 def _print(runs: list[Run]) -> None:
-    """Where each run ended, and what the time bought, in words."""
+    """Print where each run ended, and sentences about the accuracy gained over time."""
     from acquire.evaluate.knees import sentences
     from acquire.evaluate.tradeoff_figures import in_series
 
@@ -268,8 +278,8 @@ def _print(runs: list[Run]) -> None:
         )
         for run in runs
     ]
-    titles = ("case", "voxels", "solver", "preset", "iterations", "wall s", "processor s")
-    print_table((*titles, "PSNR", "SSIM", "amplitude", "Hz off"), rows)
+    titles = ("case", "voxels", "solver", "preset", "iterations", "wall (s)", "processor (s)")
+    print_table((*titles, "PSNR (dB)", "SSIM", "amplitude error", "frequency error (Hz)"), rows)
     for case, voxels in dict.fromkeys((run.case, run.voxels) for run in runs):
         own = [run for run in runs if (run.case, run.voxels) == (case, voxels)]
         for repeats in in_series(own).values():

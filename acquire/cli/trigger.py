@@ -1,6 +1,8 @@
-"""``acquire trigger``: the sync trigger by itself; its test patterns are `acquire.cli.trigger_patterns`.
+"""``acquire trigger``: operate the sync trigger directly. Its test patterns are in
+`acquire.cli.trigger_patterns`.
 
-These commands talk to the device, not to the daemon: while a daemon has the port, they are told so.
+These commands talk to the device and not to the daemon. They fail with a message while a daemon uses the
+port.
 """
 
 from __future__ import annotations
@@ -34,7 +36,12 @@ def register(app: typer.Typer) -> None:
     group = typer.Typer(no_args_is_help=True, rich_markup_mode="rich")
     for command in (info, load, arm, stop, selftest, monitor, blink, square):
         group.command()(command)
-    app.add_typer(group, name="trigger", help="The sync trigger by itself.", rich_help_panel="Rig")
+    app.add_typer(
+        group,
+        name="trigger",
+        help="Operate the sync trigger directly, without the daemon.",
+        rich_help_panel="Rig",
+    )
 
 
 def info(
@@ -43,7 +50,7 @@ def info(
     settings: SetOption = None,
     json: JsonFlag = False,
 ) -> None:
-    """Who answers, what it can do and what it does now.
+    """Show the identity, the capabilities and the current state of the trigger.
 
     Example: [bold]acquire trigger info --url /dev/ttyUSB0[/]
     """
@@ -59,13 +66,16 @@ def info(
 
 
 def load(
-    file: Annotated[Path, typer.Argument(help="Code: text of 0 and 1 (white space is ignored), or .npy.")],
+    file: Annotated[
+        Path,
+        typer.Argument(help="File with the code: text of 0 and 1 (white space is ignored), or a .npy array."),
+    ],
     config: ConfigOption = "rig-demo",
     url: UrlOption = None,
     settings: SetOption = None,
     json: JsonFlag = False,
 ) -> None:
-    """Load the code memory, have the device check it, read it back.
+    """Load a code into the code memory, let the device check it, and read it back.
 
     Example: [bold]acquire trigger load code.txt --url /dev/ttyUSB0[/]
     """
@@ -77,7 +87,7 @@ def load(
         facts = {"bits": len(bits), "ones": int(bits.sum()), "crc": f"{crc:#010x}"}
         facts["load_ms"] = round((time.monotonic() - begun_s) * 1000, 1)
         if (device.read_code(len(bits)) != bits).any():
-            raise TriggerError("the code memory reads back as something else")
+            raise TriggerError("the code memory reads back differently from what was loaded")
     if json:
         print_json(facts)
         return
@@ -88,18 +98,18 @@ def arm(
     config: ConfigOption = "rig-demo",
     url: UrlOption = None,
     settings: SetOption = None,
-    run_id: Annotated[str | None, typer.Option(help="Name of the run; absent: a new name.")] = None,
-    start: Annotated[bool, typer.Option("--start", help="Start the run as well.")] = False,
+    run_id: Annotated[str | None, typer.Option(help="Name of the run. Default: a new name.")] = None,
+    start: Annotated[bool, typer.Option("--start", help="Also start the run.")] = False,
     memory: Annotated[
         bool,
-        typer.Option("--memory", help="Light the scene with the code that `acquire trigger load` loaded."),
+        typer.Option("--memory", help="Use the code loaded by `acquire trigger load` instead of the rig's."),
     ] = False,
     json: JsonFlag = False,
 ) -> None:
-    """Configure the device as the rig file says and arm it; it stays so when the command ends.
+    """Configure the trigger as in the rig file and arm it. It stays armed when the command ends.
 
-    A run without a host ends after [bold]trigger.watchdog_s[/] (10 s), light off: `monitor` keeps it going,
-    and 0 makes it go on alone.
+    Without a host, a run ends with the light off after [bold]trigger.watchdog_s[/] (10 s). `acquire trigger
+    monitor` keeps it running; trigger.watchdog_s = 0 disables the watchdog.
 
     Example: [bold]acquire trigger arm --url /dev/ttyUSB0 --set trigger.substep_ticks=50 --start[/]
     """
@@ -137,7 +147,7 @@ def stop(
     settings: SetOption = None,
     json: JsonFlag = False,
 ) -> None:
-    """End the device's run after a whole line; light off.
+    """End the trigger's run after a complete line, with the light off.
 
     Example: [bold]acquire trigger stop --url /dev/ttyUSB0[/]
     """
@@ -147,7 +157,7 @@ def stop(
     if json:
         print_json({"lines": lines})
         return
-    say(f"stopped; {lines} lines")
+    say(f"stopped after {lines} lines")
 
 
 def selftest(
@@ -156,7 +166,7 @@ def selftest(
     settings: SetOption = None,
     json: JsonFlag = False,
 ) -> None:
-    """Have the device test its memory, its code generator and its checksum unit.
+    """Let the trigger test its memory, its code generator and its checksum unit.
 
     Example: [bold]acquire trigger selftest --url /dev/ttyUSB0[/]
     """
@@ -164,43 +174,51 @@ def selftest(
         result = driver.device().self_test()
     failed = [name.removesuffix("_failed") for name, bit in result.items() if name != "done" and bit]
     if failed or not result["done"]:
-        raise TriggerError(f"self test failed: {', '.join(failed) or 'it was not made'}")
+        raise TriggerError(f"the self-test failed: {', '.join(failed) or 'it was not run'}")
     if json:
         print_json({"passed": True})
         return
-    say("self test passed")
+    say("the self-test passed")
 
 
 def monitor(
     config: ConfigOption = "rig-demo",
     url: UrlOption = None,
     settings: SetOption = None,
-    tags: Annotated[int | None, typer.Option(min=1, help="End after so many tags.")] = None,
+    tags: Annotated[int | None, typer.Option(min=1, help="End after this number of tags.")] = None,
     seconds: Annotated[
         float | None, typer.Option(parser=seconds_between(0), metavar="TIME", help="End after this time.")
     ] = None,
     json: JsonFlag = False,
 ) -> None:
-    """Print tags as they come, until the run ends or Ctrl-C. With --json, one object per line.
+    """Print the trigger's tags as they arrive, until the run ends or Ctrl-C. With --json, one object per
+    line.
 
     Example: [bold]acquire trigger monitor --url /dev/ttyUSB0 --seconds 5[/]
     """
     from itertools import islice
 
+    from acquire.trigger.registers import TagFlag
+
     with device_of(config, url, settings) as (driver, _):
         for tag in islice(_watch(driver.device(), seconds), tags):
-            facts = _tag_facts(tag)
+            facts = {
+                "line": tag.line,
+                "code_index": tag.code_index,
+                "time": tag.timestamp,
+                "flags": "+".join(str(flag.name) for flag in TagFlag if tag.flags & flag),
+            }
             text = json_text.dumps(facts) if json else "  ".join(f"{k} {v}" for k, v in facts.items())
             say(text)
 
 
 def _watch(device: Device, seconds: float | None) -> Iterator[TagRecord]:
-    """Tags of the run under way. Asks for the status now and then, which keeps a watchdog quiet."""
+    """Yield the tags of the current run. Polling the status keeps the watchdog from ending the run."""
     from acquire.trigger.registers import TagFlag
 
     if device.status().at_rest:
         raise TriggerError(
-            "nothing to monitor: no run is armed or running", hint="acquire trigger arm --start"
+            "there are no tags to monitor: no run is armed or running", hint="acquire trigger arm --start"
         )
     end_s = time.monotonic() + seconds if seconds is not None else float("inf")
     while time.monotonic() < end_s:
@@ -211,20 +229,8 @@ def _watch(device: Device, seconds: float | None) -> Iterator[TagRecord]:
         device.status()
 
 
-def _tag_facts(tag: TagRecord) -> dict[str, object]:
-    from acquire.trigger.registers import TagFlag
-
-    flags = [flag.name for flag in TagFlag if tag.flags & flag]
-    return {
-        "line": tag.line,
-        "code_index": tag.code_index,
-        "time": tag.timestamp,
-        "flags": "+".join(map(str, flags)),
-    }
-
-
 def _read_code(file: Path) -> NDArray[np.uint8]:
-    """Bits, 0 or 1 each. Raises UsageError for what is no code."""
+    """Read the bits of a code, each 0 or 1. Raises UsageError for other contents."""
     import numpy as np
 
     try:
@@ -236,5 +242,5 @@ def _read_code(file: Path) -> NDArray[np.uint8]:
     except (OSError, ValueError) as error:
         raise UsageError(f"{file} cannot be read as a code: {error}") from error
     if bits.ndim != 1 or not len(bits) or not np.isin(bits, (0, 1)).all():
-        raise UsageError(f"{file} is no code", possible="one row of 0 and 1")
+        raise UsageError(f"{file} is not a code", possible="one row of 0 and 1")
     return bits.astype(np.uint8)

@@ -1,4 +1,4 @@
-"""The device that ``acquire trigger``'s commands talk to: the rig's, or one at another port."""
+"""The device that ``acquire trigger`` operates: the trigger of a rig, or one on another port."""
 
 from __future__ import annotations
 
@@ -19,18 +19,25 @@ if TYPE_CHECKING:
 ConfigOption = Annotated[
     str,
     typer.Option(
-        "--config", "-c", metavar="FILE", autocompletion=rigs, help="Rig file, or the name of a built-in one."
+        "--config", "-c", metavar="FILE", autocompletion=rigs, help="Rig file, or the name of a built-in rig."
     ),
 ]
 UrlOption = Annotated[
     str | None,
     typer.Option(
-        "--url", "--port", metavar="URL", help="Serial port or socket://host:port, not the rig file's."
+        "--url",
+        "--port",
+        metavar="URL",
+        help="Serial port, or socket://host:port, to use instead of the one in the rig file.",
     ),
 ]
 SetOption = Annotated[
     list[str] | None,
-    typer.Option("--set", metavar="KEY=VALUE", help="Change one value of the file, e.g. code.seed=7."),
+    typer.Option(
+        "--set",
+        metavar="KEY=VALUE",
+        help="Override one value of the rig file, such as code.seed=7. Repeatable.",
+    ),
 ]
 
 
@@ -38,7 +45,7 @@ SetOption = Annotated[
 def device_of(
     config: str, url: str | None, settings: list[str] | None
 ) -> Iterator[tuple[TriggerDriver, RigConfig]]:
-    """The rig's trigger; left as it is at the end."""
+    """Open the rig's trigger; at the end it is released in the state that it is in."""
     from acquire.config import load_rig, parse_settings
     from acquire.rig import open_trigger
     from acquire.trigger.driver import TriggerDriver
@@ -50,8 +57,8 @@ def device_of(
     driver = open_trigger(rig)
     if not isinstance(driver, TriggerDriver):
         raise UsageError(
-            f"trigger.driver = {rig.trigger.driver!r} is no board with this project's gateware",
-            possible="'simulated', 'rtl', 'serial', 'usb'; for others: acquire devices, acquire serve",
+            f"trigger.driver = {rig.trigger.driver!r} is not a board with this project's gateware",
+            possible="'simulated', 'rtl', 'serial', 'usb'; for other drivers: acquire devices, acquire serve",
         )
     try:
         yield driver, rig

@@ -1,7 +1,7 @@
-"""``acquire trigger blink | square``: the light as a square wave, to see that wires and levels are right.
+"""``acquire trigger blink | square``: drive the light with a square wave, to check wires and levels.
 
-The code memory holds the pattern and the run is an ordinary one, so that what is seen here is what a
-measurement has: the same pins, levels, delays and watchdog.
+The pattern is loaded into the code memory and runs like an ordinary code, so the test uses the same pins,
+levels, delays and watchdog as a measurement.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ _LOOK_S = 0.2
 SecondsOption = Annotated[
     float | None,
     typer.Option(
-        parser=seconds_between(0.1, 86400), metavar="TIME", help="End after this time; absent: at Ctrl-C."
+        parser=seconds_between(0.1, 86400), metavar="TIME", help="End after this time. Default: at Ctrl-C."
     ),
 ]
 
@@ -40,10 +40,10 @@ def blink(
     seconds: SecondsOption = None,
     json: JsonFlag = False,
 ) -> None:
-    """Let the light blink, slowly enough for the eye, while the cameras get their line triggers.
+    """Let the light blink slowly enough for the eye, while the cameras get their line triggers.
 
-    Needs no camera. Shows that the light is the trigger's and which level lights it: dark before, between and
-    after. Runs until Ctrl-C or --seconds, then the light is off.
+    No camera is needed. The test shows that the trigger controls the light and which level turns it on: it is
+    dark before, between and after the flashes. It runs until Ctrl-C or --seconds, then the light is off.
 
     Example: [bold]acquire trigger blink --url /dev/ttyUSB0[/]
     """
@@ -64,17 +64,19 @@ def square(
         typer.Option(
             min=1,
             max=2**31,
-            help="That the light is on, and then off; 1 is the fastest. Absent: those of a line.",
+            help="Number of sub-steps for which the light is on, and then off. 1 is the fastest. Default: "
+            "one line.",
         ),
     ] = None,
     seconds: SecondsOption = None,
     json: JsonFlag = False,
 ) -> None:
-    """Let the light be a square wave of the instrument's own pace, for an oscilloscope.
+    """Drive the light with a square wave in step with the lines, for an oscilloscope.
 
-    A line lit, a line dark: the light's edges then stand at every line start, so that a scope on the line
-    trigger and a photodiode shows how late the light is. --substeps 1 is the fastest light of this rig.
-    Runs until Ctrl-C or --seconds, then the light is off.
+    By default the light is on for one line and off for the next. Its edges then coincide with the line
+    starts, so that an oscilloscope on the line trigger and a photodiode shows the delay of the light.
+    --substeps 1 is the fastest light of this rig. The test runs until Ctrl-C or --seconds, then the light is
+    off.
 
     Example: [bold]acquire trigger square --url /dev/ttyUSB0 --substeps 1[/]
     """
@@ -95,8 +97,8 @@ def _run(
     *,
     json: bool,
 ) -> None:
-    """Load the pattern, run it until it is time, light off; say what is to be seen, and what was counted."""
-    from acquire.cli.interrupts import first_interrupt_asks
+    """Load and run the pattern, then turn the light off; print the signals to expect, and the counts."""
+    from acquire.cli.interrupts import stop_on_interrupt
     from acquire.daemon.plan import new_run_id
     from acquire.trigger.base import TriggerRun
     from acquire.trigger.settings import LoadedCode
@@ -109,40 +111,45 @@ def _run(
         substep_ticks=wave.substep_ticks,
         tag_every_lines=rig.trigger.tag_every_lines,
     )
-    with first_interrupt_asks("light off") as asked:
+    with stop_on_interrupt("turning the light off") as stop_requested:
         if device.status().at_rest:
             device.load_code(wave.bits)
-        driver.prepare(run)  # which refuses where another run is under way
+        driver.prepare(run)  # refuses if another run is in progress
         facts = _facts(rig, wave, device.capabilities.clock_hz)
         try:
             driver.start()
             if not json:
                 print_facts({name: facts[name] for name in ("light", "trigger_a", "trigger_b")})
-                note("runs" + (" until Ctrl-C" if seconds is None else f" for {seconds:g} s"))
-            _until(driver, asked, seconds)
+                note("running" + (" until Ctrl-C" if seconds is None else f" for {seconds:g} s"))
+            _wait(driver, stop_requested, seconds)
             counted = {key: value for key, value in driver.statistics().items() if key.startswith("strobe")}
         finally:
             lines = driver.stop()
     if json:
         print_json(facts | {"lines": lines} | counted)
         return
-    print_facts({"lines": lines, **_answers(rig, counted)})
+    strobes = {
+        f"camera {arm}": f"{counted[f'strobe_{arm}_seen']} strobes, {counted[f'strobe_{arm}_missed']} missed"
+        for arm, output in (("a", rig.trigger.a), ("b", rig.trigger.b))
+        if output.strobe
+    }
+    print_facts({"lines": lines, **strobes})
 
 
-def _until(driver: TriggerDriver, asked: threading.Event, seconds: float | None) -> None:
-    """Keep the watchdog quiet until it is time. TriggerError where the run ends by itself."""
+def _wait(driver: TriggerDriver, stop_requested: threading.Event, seconds: float | None) -> None:
+    """Wait for the end, and keep the watchdog from ending the run. Raises TriggerError if it ends early."""
     from acquire.errors import TriggerError
 
     end_s = time.monotonic() + seconds if seconds is not None else float("inf")
-    while not asked.is_set() and (left_s := end_s - time.monotonic()) > 0:
+    while not stop_requested.is_set() and (left_s := end_s - time.monotonic()) > 0:
         driver.tags(min(_LOOK_S, left_s))
         status = driver.device().status()
         if status.at_rest:
-            raise TriggerError(f"the run ended by itself: {status}", hint="acquire trigger info")
+            raise TriggerError(f"the run ended unexpectedly: {status}", hint="acquire trigger info")
 
 
 def _facts(rig: RigConfig, wave: SquareWave, clock_hz: int) -> dict[str, Any]:
-    """What the pins do, by the names of `firmware/ELECTRICAL.md`."""
+    """Describe the signals on the pins, by their names in `firmware/ELECTRICAL.md`."""
     substep_s = wave.substep_ticks / clock_hz
     per_line = rig.trigger.line_start == "per-line"
     pulses_hz = 1 / substep_s / (rig.geometry.substeps if per_line else 1)
@@ -164,12 +171,3 @@ def _time(seconds: float) -> str:
         if seconds >= factor:
             return f"{seconds / factor:.4g} {unit}"
     return f"{seconds * 1e9:.4g} ns"
-
-
-def _answers(rig: RigConfig, counted: dict[str, Any]) -> dict[str, str]:
-    """Strobes of the cameras that answer, in words."""
-    return {
-        f"camera {arm}": f"{counted[f'strobe_{arm}_seen']} strobes, {counted[f'strobe_{arm}_missed']} missed"
-        for arm, output in (("a", rig.trigger.a), ("b", rig.trigger.b))
-        if output.strobe
-    }

@@ -1,4 +1,4 @@
-"""Runs the commands: wrong words become the same kind of error as everything else that a user meets."""
+"""Builds and runs the commands. Mistakes on the command line raise the same errors as everything else."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import typer
 
-from acquire.cli.coercion import ease
+from acquire.cli.coercion import use_quick_coercion
 from acquire.cli.commands import BY_NAME, MODULES
 from acquire.cli.help import EXAMPLE, SUMMARY, make_plain, overview
 from acquire.cli.output import say
@@ -19,25 +19,25 @@ from acquire.errors import EXIT_INTERRUPTED, UsageError
 from acquire.text import did_you_mean
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator, Sequence
+    from collections.abc import Iterable, Sequence
 
-_WordsError = next(
+_ParseError = next(
     kind
     for kind in typer.BadParameter.__mro__
     if issubclass(kind, Exception) and kind.__name__ == "ClickException"
 )
-"""What typer raises for words that it cannot take: click's, or the copy of click that typer brings."""
+"""Base class of typer's parsing errors. It is defined in click, or in the copy of click inside typer."""
 
 _EXTRA = re.compile(r"extra == ['\"](\w+)['\"]")
 _HELP = ("-h", "--help")
 _PACKAGES = {"PIL": "pillow"}
-"""Modules that are named otherwise than the package that brings them."""
+"""Modules whose name differs from that of their package."""
 _WHOLE = {"simulate": "simulate", "demo": "report", "paper": "report", "tradeoff": "report", "web": "web"}
-"""Command → the extra that brings all that it needs, where several bring what is missing."""
+"""Command → the extra that installs everything it needs, for packages that several extras install."""
 
 
 def build(modules: Iterable[str] = MODULES) -> typer.Typer:
-    """The commands of some modules of `acquire.cli`, or all of them."""
+    """Build the application with the commands of the given modules of `acquire.cli` (default: all)."""
     app = typer.Typer(
         name="acquire",
         help=SUMMARY,
@@ -54,9 +54,9 @@ def build(modules: Iterable[str] = MODULES) -> typer.Typer:
 
 
 def run(words: Sequence[str]) -> int:
-    """Run the command that the words name; its exit code. Raises UsageError for words that are wrong."""
+    """Run a command line and return its exit code. Raises UsageError if it cannot be parsed."""
     if VARIABLE in os.environ:
-        # What Tab offers: of the command that is there already, or of all.
+        # The shell asks for completions: those of the command typed so far, or of all commands.
         from acquire.cli.completion import complete, words_so_far
 
         before = [word for word in words_so_far() if not word.startswith("-")][:1]
@@ -71,45 +71,45 @@ def run(words: Sequence[str]) -> int:
 
         say(__version__)
         return 0
+    if first not in BY_NAME:
+        is_option = first.startswith("-")
+        what = f"there is no option {first}" if is_option else f"there is no command {first!r}"
+        known = ("--version", *_HELP) if is_option else tuple(BY_NAME)
+        raise UsageError(
+            f"{what}{did_you_mean(first, known)}", possible=", ".join(sorted(known)), hint="acquire --help"
+        )
+    command = command_of([BY_NAME[first].module])
     try:
-        code = command_of(_module_of(first))(args=list(words), prog_name="acquire", standalone_mode=False)
+        code = command(args=list(words), prog_name="acquire", standalone_mode=False)
     except typer.Abort:
         return EXIT_INTERRUPTED
-    except _WordsError as error:
+    except _ParseError as error:
         if type(error).__name__ == "NoArgsIsHelpError":
             say_lines(error.format_message(), err=True)  # type: ignore[attr-defined]
             return UsageError.exit_code
-        raise _as_ours(error) from error
+        raise _usage_error(error) from error
     return code if isinstance(code, int) else 0
 
 
 def say_lines(text: str, *, err: bool = False) -> None:
-    """Several lines of our own."""
+    """Print a text of several lines."""
     for line in text.splitlines():
         say(line, err=err)
 
 
 def command_of(modules: Iterable[str]) -> Any:
-    """The commands of some modules, ready to be called: help in plain words, and values taken quickly."""
+    """Return the click command of some modules, with plain help and quick coercion of option values."""
     command = typer.main.get_command(build(modules))
     make_plain(command)
-    ease(command)
+    use_quick_coercion(command)
     return command
 
 
-def _module_of(word: str) -> tuple[str, ...]:
-    if word in BY_NAME:
-        return (BY_NAME[word].module,)
-    what = "there is no option" if word.startswith("-") else "there is no command"
-    shown = f" {word}" if word.startswith("-") else f" {word!r}"
-    known = ("--version", *_HELP) if word.startswith("-") else tuple(BY_NAME)
-    raise UsageError(
-        f"{what}{shown}{did_you_mean(word, known)}", possible=", ".join(sorted(known)), hint="acquire --help"
-    )
-
-
 def not_installed(error: ModuleNotFoundError) -> UsageError:
-    """The error for a package that is missing, with the extra that the command needs; ours is a defect."""
+    """Return the error for a missing package, which names the extra to install.
+
+    A missing module of ``acquire`` itself is a defect of ours: its error is raised again.
+    """
     module = (error.name or "").partition(".")[0]
     if module == "acquire":
         raise error
@@ -129,34 +129,28 @@ def not_installed(error: ModuleNotFoundError) -> UsageError:
     )
 
 
-def _as_ours(error: Any) -> UsageError:
-    """In the voice of all errors: the command, what was wrong with its words, and where help is."""
+def _usage_error(error: Any) -> UsageError:
+    """Rewrite one of click's errors in our own style: the command, the mistake, and where to find help."""
     context, near = getattr(error, "ctx", None), getattr(error, "possibilities", None)
     command = context.command_path if context is not None else "acquire"
-    said = (error.message if near else error.format_message()).partition(" Did you mean")[0].rstrip(".")
     where = f"{command.removeprefix('acquire').lstrip()}: ".removeprefix(": ")
-    mistaken = said.partition("'")[2].partition("'")[0]  # the word that click quotes
-    meant = f"; did you mean {near[0]!r}?" if near else did_you_mean(mistaken, _choices(context))
+    message = (error.message if near else error.format_message()).partition(" Did you mean")[0].rstrip(".")
+    # click's messages have no verb in these two cases
+    sentence = message[:1].lower() + message[1:]
+    sentence = re.sub(r"^no such (option|command):? ", r"there is no \1 ", sentence)
+    sentence = re.sub(r"^missing ((?:option|argument) .*)", r"the \1 is missing", sentence)
+    # for a group of commands whose subcommand is missing or unknown
+    choices = list(getattr(context.command, "commands", {})) if context is not None else []
+    mistaken = message.partition("'")[2].partition("'")[0]  # the word that click quotes
+    meant = f"; did you mean {near[0]!r}?" if near else did_you_mean(mistaken, choices)
     return UsageError(
-        f"{where}{_sentence(said[:1].lower() + said[1:])}{meant}",
-        possible=", ".join(sorted(near) if near else _choices(context)),
+        f"{where}{sentence}{meant}",
+        possible=", ".join(sorted(near) if near else choices),
         hint=f"{command} --help",
     )
 
 
-def _sentence(said: str) -> str:
-    """With a verb where click has none."""
-    said = re.sub(r"^no such (option|command):? ", r"there is no \1 ", said)
-    return re.sub(r"^missing ((?:option|argument) .*)", r"the \1 is missing", said)
-
-
-def _choices(context: Any) -> Iterator[str]:
-    """The commands of a group whose name alone was given, or one that is none of them."""
-    commands = getattr(context.command, "commands", {}) if context is not None else {}
-    yield from commands
-
-
 def _options(
-    version: bool = typer.Option(False, "--version", help="Print the version and end."),
+    version: bool = typer.Option(False, "--version", help="Print the version and exit."),
 ) -> None:
-    """Options of the program itself; `run` answers them."""
+    """Declare the options of the program itself, which `run` handles."""

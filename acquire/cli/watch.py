@@ -1,4 +1,4 @@
-"""``acquire status --watch``: the same page again and again on a terminal, a line each time elsewhere."""
+"""``acquire status --watch``: redraw the status on a terminal; elsewhere print one line per update."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import time
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
-from acquire.cli.interrupts import first_interrupt_asks
+from acquire.cli.interrupts import stop_on_interrupt
 from acquire.cli.output import json_text, say
 from acquire.cli.status_page import status_line, status_lines
 from acquire.client import Client
@@ -18,20 +18,20 @@ if TYPE_CHECKING:
     from pathlib import Path
 
 SHORTEST_S = 0.1
-"""The daemon has other things to do."""
+"""Shortest time between two updates, to keep the load on the daemon low."""
 
 
 def watch_status(socket: Path | None, every_s: float, *, as_json: bool) -> None:
-    """Show the status every ``every_s`` until Ctrl-C; a daemon that has gone is waited for, and said to be.
+    """Show the status every ``every_s`` until Ctrl-C. If the daemon ends, wait for it and show that.
 
-    Raises NoDaemonError where there is none to begin with.
+    Raises NoDaemonError if no daemon is running at the start.
     """
     client = Client(socket)
     status: Any = client.status().model_dump(mode="json")
-    with first_interrupt_asks("ending") as asked, _screen(as_json=as_json) as draw:
-        while not asked.is_set():
+    with stop_on_interrupt("ending") as stop_requested, _display(as_json=as_json) as draw:
+        while not stop_requested.is_set():
             draw(status)
-            asked.wait(max(SHORTEST_S, every_s))
+            stop_requested.wait(max(SHORTEST_S, every_s))
             try:
                 status = client.status().model_dump(mode="json")
             except NoDaemonError as error:
@@ -39,9 +39,19 @@ def watch_status(socket: Path | None, every_s: float, *, as_json: bool) -> None:
 
 
 @contextmanager
-def _screen(*, as_json: bool) -> Iterator[Callable[[Any], None]]:
+def _display(*, as_json: bool) -> Iterator[Callable[[Any], None]]:
+    """Yield a function that shows a status document, or the error of a daemon that has ended."""
     if as_json or not sys.stdout.isatty():
-        yield _json if as_json else _line
+
+        def write(status: Any) -> None:
+            ended = isinstance(status, NoDaemonError)
+            if as_json:
+                say(json_text({"error": status.to_dict()} if ended else status))
+            else:
+                say(f"{time.strftime('%H:%M:%S')} {status.message if ended else status_line(status)}")
+            sys.stdout.flush()
+
+        yield write
         return
     from rich.console import Console
     from rich.live import Live
@@ -50,20 +60,7 @@ def _screen(*, as_json: bool) -> Iterator[Callable[[Any], None]]:
     with Live(console=Console(), auto_refresh=False, vertical_overflow="visible") as live:
 
         def draw(status: Any) -> None:
-            live.update(Text("\n".join(_gone(status) or status_lines(status))), refresh=True)
+            lines = [status.message] if isinstance(status, NoDaemonError) else status_lines(status)
+            live.update(Text("\n".join(lines)), refresh=True)
 
         yield draw
-
-
-def _line(status: Any) -> None:
-    say(f"{time.strftime('%H:%M:%S')} {' '.join(_gone(status)) or status_line(status)}")
-    sys.stdout.flush()
-
-
-def _json(status: Any) -> None:
-    say(json_text({"error": status.to_dict()} if isinstance(status, NoDaemonError) else status))
-    sys.stdout.flush()
-
-
-def _gone(status: Any) -> list[str]:
-    return [status.message] if isinstance(status, NoDaemonError) else []

@@ -1,4 +1,4 @@
-"""``acquire web``: the operator's page in the foreground, or its address with the token."""
+"""``acquire web``: serve the operator's page in the foreground, or print its address with the token."""
 
 from __future__ import annotations
 
@@ -11,8 +11,6 @@ from acquire.cli.completion import rigs
 from acquire.cli.output import say
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
-
     from acquire.config.web import WebConfig
 
 
@@ -28,23 +26,27 @@ def web(
             "-c",
             metavar="FILE",
             autocompletion=rigs,
-            help="Rig file with [web]; else its defaults.",
+            help="Rig file with the [web] settings. Default: built-in settings.",
         ),
     ] = None,
     socket: Annotated[
-        Path | None, typer.Option("--socket", envvar="ACQUIRE_SOCKET", help="The daemon's control socket.")
+        Path | None, typer.Option("--socket", envvar="ACQUIRE_SOCKET", help="Control socket of the daemon.")
     ] = None,
-    host: Annotated[str | None, typer.Option(help="Address to listen on, instead of web.host.")] = None,
-    port: Annotated[int | None, typer.Option(help="Port to listen on, instead of web.port.")] = None,
+    host: Annotated[
+        str | None, typer.Option(help="Address to listen on. Default: web.host of the rig file.")
+    ] = None,
+    port: Annotated[
+        int | None, typer.Option(help="Port to listen on. Default: web.port of the rig file.")
+    ] = None,
     link: Annotated[
-        bool, typer.Option("--link", help="Print the page's address with the token, and end.")
+        bool, typer.Option("--link", help="Print the page's address with the operator's token, and exit.")
     ] = False,
     viewer: Annotated[
-        bool, typer.Option("--viewer", help="With --link: the token of those who only look.")
+        bool, typer.Option("--viewer", help="With --link: print the address with the read-only viewer token.")
     ] = False,
     given: Annotated[
         str | None,
-        typer.Option("--given", hidden=True, help="For the daemon, which starts the page with it."),
+        typer.Option("--given", hidden=True, help="Settings from the daemon, when it starts the page."),
     ] = None,
     owned: Annotated[
         bool, typer.Option("--owned", hidden=True, help="End as on SIGTERM when standard input is closed.")
@@ -52,9 +54,10 @@ def web(
 ) -> None:
     """Serve the operator's page for the daemon of this host, until SIGTERM or Ctrl-C.
 
-    `acquire serve` does so automatically where the rig has [web]. Nobody waits for the page: the capture
-    goes on whatever becomes of it. Who opens it needs a token, which --link prints; other hosts reach it by
-    `ssh -L 8300:127.0.0.1:8300 HOST`, or with a certificate (web.host, web.certificate, web.key).
+    `acquire serve` does this automatically if the rig file has [web]. The capture never waits for the page
+    and continues if the page fails. Opening the page requires a token, which --link prints. Other hosts can
+    reach it through `ssh -L 8300:127.0.0.1:8300 HOST`, or with a certificate (web.host, web.certificate,
+    web.key).
 
     Example: [bold]acquire web --link[/]
     """
@@ -80,11 +83,14 @@ def web(
 def _settings(
     config: str | None, socket: Path | None, given: str | None, host: str | None, port: int | None
 ) -> tuple[Path, Path | None, WebConfig]:
-    """Socket, directory of the recordings where it is known, and how to listen."""
+    """Return the daemon's socket, the directory of the recordings if it is known, and the page's settings."""
     import json
+
+    from pydantic import ValidationError
 
     from acquire.config import load_rig
     from acquire.config.web import WebConfig
+    from acquire.errors import UsageError
     from acquire.place import default_socket
 
     if given is not None:
@@ -94,19 +100,10 @@ def _settings(
     rig = None if config is None else load_rig(config)
     settings = (rig.web if rig else None) or WebConfig()
     changes = {key: value for key, value in (("host", host), ("port", port)) if value is not None}
-    if changes:
-        settings = _changed(settings, changes)
+    if changes:  # validated again, because another address may need a certificate
+        try:
+            settings = type(settings).model_validate({**settings.model_dump(), **changes})
+        except ValidationError as error:
+            raise UsageError(error.errors()[0]["msg"].removeprefix("Value error, ")) from error
     where = socket or (rig.control.socket if rig else default_socket())
     return where.absolute(), rig.recording.directory.absolute() if rig else None, settings
-
-
-def _changed(settings: WebConfig, changes: Mapping[str, object]) -> WebConfig:
-    """Validated anew: another host may need a certificate. Raises UsageError."""
-    from pydantic import ValidationError
-
-    from acquire.errors import UsageError
-
-    try:
-        return type(settings).model_validate({**settings.model_dump(), **changes})
-    except ValidationError as error:
-        raise UsageError(error.errors()[0]["msg"].removeprefix("Value error, ")) from error

@@ -1,5 +1,5 @@
-"""Names that the shell's completion and the program agree on."""
+"""Names shared by the program and the shell's completion script."""
 
 PROGRAM = "acquire"
 VARIABLE = "_ACQUIRE_COMPLETE"
-"""Set while Tab asks what fits."""
+"""Environment variable that the shell sets when it asks for completions."""

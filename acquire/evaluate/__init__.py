@@ -1,4 +1,4 @@
-"""How good a video is, and the report that shows it: pure functions from arrays to numbers and pictures.
+"""The quality of a video, and the pages that show it: pure functions from arrays to numbers and pictures.
 
 ::
 
@@ -12,8 +12,8 @@
     scenes of the paper  --> paper     its figures     --> paper.page
     videos on disk       --> rendering movies, sheets, video_page
 
-    page (templates), themed (drawings), player (videos), host (how busy): what the pages have in common
+    shared by the pages: page (templates), themed (drawings), player (videos), host (load of the machine)
 
-Nothing here opens a device or a socket. Only reports, pages and renderings write files; ``paper`` also
-makes the recordings that it needs.
+Nothing here opens a device or a socket. Only reports, pages and renderings write files; ``paper`` also makes
+the recordings that it needs.
 """

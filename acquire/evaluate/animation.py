@@ -24,13 +24,13 @@ BAR_PX = 26
 MAX_FRAMES = 150
 MAX_BYTES = 3_000_000
 FRAME_DURATION_MS = 80
-"""Slow, because fast flicker can harm: of the 10 µs frames every 4th is shown, and 5 kHz becomes 2.5 Hz."""
+"""Slow, because fast flicker can cause harm: with every 4th of the 10 µs frames, 5 kHz becomes 2.5 Hz."""
 
 
 def save_animation(
     result: DemoResult, path: Path, *, max_frames: int = MAX_FRAMES, max_bytes: int = MAX_BYTES
 ) -> int:
-    """Write every k-th frame to ``path`` (WebP); returns k, the smallest that keeps to both limits.
+    """Write every k-th frame to ``path`` (WebP) and return k, the smallest that keeps to both limits.
 
     Raises UsageError when not even two frames fit into ``max_bytes``.
     """
@@ -49,7 +49,7 @@ def save_animation(
 
 
 def write_webp(path: Path, pictures: list[Image.Image], duration_ms: int = FRAME_DURATION_MS) -> None:
-    """An endless loop of the pictures, each shown ``duration_ms``."""
+    """Write an endless loop of the pictures, each shown for ``duration_ms``."""
     first, *rest = pictures
     first.save(
         path,
@@ -64,21 +64,21 @@ def write_webp(path: Path, pictures: list[Image.Image], duration_ms: int = FRAME
 
 
 def stills(path: Path) -> Iterator[bytes]:
-    """The frames of an animation, each a WebP picture of its own: a player can stop at any."""
+    """Yield the frames of an animation as separate WebP pictures, for a player that can stop at any."""
     with Image.open(path) as pictures:
         for picture in ImageSequence.Iterator(pictures):
             yield webp(picture.convert("RGB"), 75)
 
 
 def webp(picture: Image.Image, quality: int) -> bytes:
-    """One picture, lossy."""
+    """Encode one picture as lossy WebP."""
     file = BytesIO()
     picture.save(file, "WEBP", quality=quality, method=2)
     return file.getvalue()
 
 
 def draw_frame(result: DemoResult, frame: int) -> Image.Image:
-    """One picture: a bar of labels, a panel of the truth and of each solver, a bar with the time."""
+    """Draw one picture: a bar of labels, panels of the truth and of each solver, a bar with the time."""
     panels = [("truth", result.truth), *((solver.label, solver.video) for solver in result.solvers)]
     width = len(panels) * (PANEL_PX + GAP_PX) - GAP_PX
     picture = Image.new("RGB", (width, PANEL_PX + 2 * BAR_PX), "#12181f")
@@ -94,9 +94,9 @@ def draw_frame(result: DemoResult, frame: int) -> Image.Image:
 
 
 def panel(frame: NDArray[Any], peak: float) -> Image.Image:
-    """A frame (row, column) as an 8-bit grey picture of PANEL_PX: 0 black, ``peak`` white."""
+    """Draw a frame (row, column) as an 8-bit grey picture of PANEL_PX: 0 is black, ``peak`` white."""
     grey = np.clip(np.rint(frame * (255 / peak)), 0, 255).astype(np.uint8)
-    # whole multiples keep their pixels; other sizes would show uneven ones
+    # an integer factor keeps the pixels sharp; any other would make them unequal
     whole = PANEL_PX % frame.shape[0] == 0 and frame.shape[0] == frame.shape[1]
     resample = Image.Resampling.NEAREST if whole else Image.Resampling.BICUBIC
     return Image.fromarray(grey).resize((PANEL_PX, PANEL_PX), resample)

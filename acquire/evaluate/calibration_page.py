@@ -1,4 +1,4 @@
-"""A calibration on one page: what every column has, where arm B's image lies, and how it was found."""
+"""A calibration on one page: the quantities of every column, the alignment of the arms, and the steps."""
 
 from __future__ import annotations
 
@@ -30,13 +30,13 @@ PANELS = (
 )
 SPOKES = 9
 ENLARGED = (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000)
-"""Displacements are drawn so many times as long, the most with which no arrow reaches the next point."""
+"""Enlargements of the displacements; the largest for which no arrow reaches the next point is used."""
 
 
 def write_page(known: Calibration, directory: Path, name: str, facts: Mapping[str, Any]) -> Path:
-    """Write ``index.html``, ``calibration.json`` and the pictures into ``directory``; returns the page.
+    """Write ``index.html``, ``calibration.json`` and the plots into ``directory``; return the page.
 
-    ``facts`` are what the command prints: name → words.
+    ``facts`` are those printed by the command: label → text.
     """
     with mpl.rc_context(STYLE):
         figures = {"columns": _columns(known), "curve": _curve(known), "field": _field(known)}
@@ -56,7 +56,7 @@ def write_page(known: Calibration, directory: Path, name: str, facts: Mapping[st
 
 
 def _columns(known: Calibration) -> Figure | None:
-    """Every quantity that a column has, both arms, with twice the standard uncertainty."""
+    """Plot every quantity of the columns of both arms, with bands of two standard uncertainties."""
     panels = [(key, label) for key, label in PANELS if key in known.quantities]
     if not panels:
         return None
@@ -79,14 +79,14 @@ def _panel(ax: Axes, known: Calibration, key: str) -> None:
     for arm, value, error, good, colour in zip(
         ARMS, measured.value, measured.uncertainty, usable, SOLVER_COLOURS, strict=False
     ):
-        seen = np.where(np.isin(x, hidden.get(arm, [])) | ~good, np.nan, value)
-        ax.fill_between(x, seen - 2 * error, seen + 2 * error, color=colour, alpha=0.25, lw=0)
-        ax.plot(x, seen, ".-", color=colour, lw=1, ms=3, label=f"camera {arm.upper()}")
+        shown = np.where(np.isin(x, hidden.get(arm, [])) | ~good, np.nan, value)
+        ax.fill_between(x, shown - 2 * error, shown + 2 * error, color=colour, alpha=0.25, lw=0)
+        ax.plot(x, shown, ".-", color=colour, lw=1, ms=3, label=f"camera {arm.upper()}")
         ax.plot(x[~good], value[~good], "x", color=MASKED, ms=6)
 
 
 def _curve(known: Calibration) -> Figure | None:
-    """By how much samples are off a straight line, with twice the standard uncertainty."""
+    """Plot the deviation of the samples from a straight line, with bands of two standard uncertainties."""
     if curve_of(known) is None:
         return None
     measured = known.quantities["excess_dn"]
@@ -98,28 +98,28 @@ def _curve(known: Calibration) -> Figure | None:
         ax.fill_between(dn, value - 2 * error, value + 2 * error, color=colour, alpha=0.25, lw=0)
         ax.plot(dn, value, color=colour, lw=1.2, label=f"camera {arm.upper()}")
     ax.axhline(0, color=INK, lw=0.6)
-    ax.set(xlabel="sample (DN)", ylabel="too high by (DN)")
+    ax.set(xlabel="sample (DN)", ylabel="deviation (DN)")
     figure.legend(loc="outside upper right", ncols=2)
     return figure
 
 
 def _field(known: Calibration) -> Figure | None:
-    """Where points of the scene lie in arm B's image beside arm A's."""
+    """Plot the displacement of arm B's image against arm A's, over the field."""
     if known.alignment is None:
         return None
     alignment, half = known.alignment.alignment, known.instrument.stages * known.instrument.substeps / 2
     at = np.linspace(-0.9 * half, 0.9 * half, SPOKES)
     points = np.stack(np.meshgrid(at, at, indexing="ij")).reshape(2, -1)
-    moved = alignment.matrix @ points + np.array([[alignment.rows], [alignment.columns]]) - points
-    largest = float(np.hypot(*moved).max())
+    displacement = alignment.matrix @ points + np.array([[alignment.rows], [alignment.columns]]) - points
+    largest = float(np.hypot(*displacement).max())
     factor = max((each for each in ENLARGED if each * largest < at[1] - at[0]), default=1)
     figure = canvas(4.6)
     ax = figure.subplots()
     ax.quiver(
         points[1],
         points[0],
-        factor * moved[1],
-        factor * moved[0],
+        factor * displacement[1],
+        factor * displacement[0],
         angles="xy",
         scale_units="xy",
         scale=1,
@@ -129,11 +129,11 @@ def _field(known: Calibration) -> Figure | None:
     ax.plot(points[1], points[0], ".", color=INK, ms=3)
     ax.set(
         aspect="equal",
-        xlabel="column (fine pixels from the middle)",
+        xlabel="column (fine pixels from the centre)",
         ylabel="row (downwards)",
         xlim=(-1.15 * half, 1.15 * half),
         ylim=(1.15 * half, -1.15 * half),
     )
-    drawn = "" if factor == 1 else f",\ndrawn {factor} × as long"
-    ax.set_title(f"Up to {largest:.2f} fine pixels{drawn}")
+    drawn = "" if factor == 1 else f",\nenlarged {factor} times"
+    ax.set_title(f"Displacement up to {largest:.2f} fine pixels{drawn}")
     return figure

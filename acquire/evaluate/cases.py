@@ -1,4 +1,4 @@
-"""What trade-offs are measured on: recordings with a known scene, procedural scenes with a camera's noise."""
+"""The cases of a trade-off: recordings with a known scene, and procedural scenes with camera noise."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ if TYPE_CHECKING:
     from acquire.store import Recording
 
 READ_NOISE_E = 10.0
-"""Electrons of an ordinary camera's read noise."""
+"""Read noise of an ordinary camera, in electrons."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Case:
-    """``name`` says what is measured on, and with which noise; ``judge`` makes it for a repeat from 0 on.
+    """A scene or recording to measure. ``name`` includes its noise; ``judge`` makes repeat 0, 1, ….
 
-    ``repeats`` says in what these differ.
+    ``repeats`` states how the repeats differ.
     """
 
     name: str
@@ -31,12 +31,12 @@ class Case:
     repeats: str
 
 
-def of_recording(
+def recording_case(
     name: str, recording: Recording, first_line: int, lines: int, apart: int, tile: Tile | None = None
 ) -> Case:
-    """Segments of ``lines`` lines, ``apart`` lines from one repeat to the next as far as there are any.
+    """Return a case of a recording: ``lines`` lines, with repeats ``apart`` lines apart while there are any.
 
-    Behind a fibre they are of a ``tile``.
+    Behind a fibre the lines are those of ``tile``.
     """
     last = recording.first_line + recording.lines - lines
 
@@ -44,12 +44,12 @@ def of_recording(
         first = max(recording.first_line, min(first_line + apart * repeat, last))
         return Judge.of(recording, recording.cut(first, lines, tile), tile)
 
-    words = "other lines, as far as there are any: another stretch of code, and other noise"
-    return Case(name if tile is None else f"{name}, tile {tile}", judge, words)
+    differences = "other lines if there are any, with other code bits and other noise"
+    return Case(name if tile is None else f"{name}, tile {tile}", judge, differences)
 
 
 def procedural(name: str, full_well_e: float, lines: int) -> Case:
-    """A procedural scene of 192 × 192 fine pixels; every repeat draws scene, code and noise anew."""
+    """Return a case of a procedural scene, 192 × 192 fine pixels; each repeat draws scene, code and noise."""
     from acquire.sim.procedural import Camera, record
 
     noisy = math.isfinite(full_well_e)
@@ -64,7 +64,7 @@ def procedural(name: str, full_well_e: float, lines: int) -> Case:
 
 
 def full_wells(words: Sequence[str]) -> list[float]:
-    """Electrons at the brightest sample, from numbers and the word ``clean``; UsageError for others."""
+    """Parse electrons in the brightest sample: numbers, or ``clean`` for infinity. Raises UsageError."""
     found = []
     for word in words:
         try:
@@ -72,6 +72,8 @@ def full_wells(words: Sequence[str]) -> list[float]:
         except ValueError:
             value = math.nan
         if not value > 1:
-            raise UsageError(f"full well {word!r} cannot be read", possible="electrons, as 1e4, or clean")
+            raise UsageError(
+                f"the full well {word!r} cannot be read", possible="electrons, such as 1e4, or 'clean'"
+            )
         found.append(value)
     return found

@@ -1,12 +1,12 @@
-"""Intensity of a region over time, the sinusoid in it, and how both compare with theory (Fig. 9c).
+"""Intensity of a region over time, its sinusoidal fit, and a comparison of both with theory (Fig. 9c).
 
-A sinusoid of frequency f is linear in everything but f::
+A sinusoid is linear in all its parameters except the frequency f::
 
     v(t) = offset + Σ_k  p_k·sin(2π·k·f·t) + q_k·cos(2π·k·f·t)          k = 1 .. harmonics
 
-so the residual of a linear least-squares fit is a function of f alone (variable projection). It is
-minimised within the main lobe about the highest peak of the spectrum. Overtones (k > 1) describe the
-distortion of an LED that is driven into saturation; "amplitude" always means that of the fundamental.
+so the residual of a linear least-squares fit depends on f alone (variable projection). It is minimised within
+the main lobe around the highest peak of the spectrum. Overtones (k > 1) describe the distortion of an LED
+that is driven into saturation; "amplitude" always means that of the fundamental.
 """
 
 from __future__ import annotations
@@ -24,19 +24,19 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 CONSTANT_SWING = 1e-6
-"""A curve whose swing is below this share of its largest value is a constant: rounding of float32."""
+"""A curve whose swing is below this share of its largest value is constant, up to rounding of float32."""
 HARMONICS = 3
-"""Fundamental, second and third: what a saturating LED makes of a sinusoid."""
+"""Fundamental, second and third harmonic: a saturating LED turns a sinusoid into these."""
 SPECTRUM_PADDING = 8
-"""The spectrum is evaluated at 1/8 of its natural spacing: the peak starts the search inside its lobe."""
+"""The spectrum is evaluated at 1/8 of its natural spacing, so that the search starts inside the main lobe."""
 
 
 @dataclass(frozen=True, slots=True)
 class SineFit:
     """``offset + amplitude·sin(2π·frequency_hz·t + phase_rad)`` plus overtones; t = 0 at the first sample.
 
-    A constant is the sinusoid of frequency 0 and amplitude 0. ``overtones`` holds (amplitude, phase) of
-    the harmonics 2, 3, … that were fitted; ``residual_rms`` is what no term explains.
+    A constant has frequency 0 and amplitude 0. ``overtones`` holds (amplitude, phase) of the fitted harmonics
+    2, 3, …; ``residual_rms`` is the RMS residual of the fit.
     """
 
     frequency_hz: float
@@ -48,7 +48,7 @@ class SineFit:
 
     @property
     def distortion(self) -> float:
-        """Root of the overtones' power over that of the fundamental (THD); 0 for a constant."""
+        """Total harmonic distortion, overtones over fundamental in amplitude (RMS); 0 for a constant."""
         if self.amplitude == 0:
             return 0.0
         return (
@@ -56,7 +56,7 @@ class SineFit:
         )
 
     def at(self, times_s: NDArray[Any]) -> NDArray[np.float64]:
-        """The fitted curve at these times, in seconds from the first sample."""
+        """Evaluate the fitted curve at times in seconds after the first sample."""
         terms = ((self.amplitude, self.phase_rad), *self.overtones)
         values = np.full(np.shape(times_s), self.offset, np.float64)
         for k, (amplitude, phase) in enumerate(terms, start=1):
@@ -66,10 +66,10 @@ class SineFit:
 
 @dataclass(frozen=True, slots=True)
 class CurveComparison:
-    """A region's measured intensity beside the theoretical one.
+    """Comparison of a region's measured intensity with the theoretical one.
 
-    ``correlation`` is Pearson's, None where either curve is constant; ``rms_error`` and the fits are in
-    the scene's units; ``level_ratio`` compares the means.
+    ``correlation`` is Pearson's, None if either curve is constant; ``rms_error`` and the fits are in the
+    units of the scene; ``level_ratio`` is the ratio of the means, measured over theory.
     """
 
     name: str
@@ -81,12 +81,12 @@ class CurveComparison:
 
     @property
     def constant(self) -> bool:
-        """Theory says that this region does not change: frequencies and amplitudes say nothing."""
+        """Whether the region is constant in theory, so that its frequency and amplitude mean nothing."""
         return self.theory.amplitude == 0
 
     @property
     def amplitude_ratio(self) -> float | None:
-        """Measured over theoretical amplitude of the fundamental: below 1 the swing was lost."""
+        """Measured over theoretical amplitude of the fundamental; below 1 if part of the swing was lost."""
         return None if self.constant else self.measured.amplitude / self.theory.amplitude
 
     @property
@@ -95,9 +95,10 @@ class CurveComparison:
 
 
 def region_mean(video: NDArray[Any], mask: NDArray[np.bool_]) -> NDArray[np.float64]:
-    """Mean (t,) over the pixels of ``mask`` (row, column) in each frame of ``video`` (t, row, column).
+    """Return the mean (t,) over the pixels of ``mask`` (row, column) in each frame of ``video`` (t, row,
+    column).
 
-    Raises UsageError for a mask of another shape or without a pixel.
+    Raises UsageError for a mask of another shape or without pixels.
     """
     if video.ndim != 3 or mask.shape != video.shape[1:] or mask.dtype != np.bool_ or not mask.any():
         mask_text = f"{np.count_nonzero(mask)} pixels of a {mask.dtype} mask {mask.shape}"
@@ -117,12 +118,11 @@ def fit_sine(
     guess_hz: float | None = None,
     harmonics: int = 1,
 ) -> SineFit:
-    """Least-squares sinusoid through ``values`` (t,), sampled every ``interval_s`` seconds.
+    """Fit a sinusoid to ``values`` (t,), sampled every ``interval_s`` seconds, by least squares.
 
-    The frequency is ``frequency_hz`` where given; else it is searched about ``guess_hz``, or about the
-    highest peak of the spectrum. Harmonics at or above half the sampling rate are left out.
-    Raises UsageError for too few samples or a frequency that cannot be seen in them, NumericsError for
-    values that are not finite.
+    The frequency is ``frequency_hz`` if given; otherwise it is searched around ``guess_hz``, or around the
+    highest peak of the spectrum. Harmonics at or above half the sampling rate are left out. Raises UsageError
+    for too few samples or a frequency that they cannot resolve, NumericsError for values that are not finite.
     """
     values = np.asarray(values, np.float64)
     _check_curve(values, interval_s, harmonics)
@@ -150,7 +150,7 @@ def fit_sine(
 
 
 def fit_constant(values: NDArray[Any]) -> SineFit:
-    """The mean as a sinusoid of frequency and amplitude 0; the residual is the ripple."""
+    """Fit a constant: frequency and amplitude are 0, and the residual is the ripple."""
     values = np.asarray(values, np.float64)
     return SineFit(0.0, 0.0, float(values.mean()), 0.0, float(values.std()))
 
@@ -158,14 +158,15 @@ def fit_constant(values: NDArray[Any]) -> SineFit:
 def compare_curve(
     name: str, theory: NDArray[Any], measured: NDArray[Any], interval_s: float, harmonics: int = HARMONICS
 ) -> CurveComparison:
-    """Fit both curves (t,) and compare them; where theory is constant, so is the model of the measured one.
+    """Fit both curves (t,) and compare them. If theory is constant, a constant is fitted to both.
 
-    Raises UsageError for lengths that differ, and as :func:`fit_sine`.
+    Raises UsageError for different lengths, and as :func:`fit_sine`.
     """
     theory, measured = np.asarray(theory, np.float64), np.asarray(measured, np.float64)
     if theory.shape != measured.shape:
         raise UsageError(
-            f"a curve {measured.shape} cannot be compared with a theory {theory.shape}", possible="one length"
+            f"a curve {measured.shape} cannot be compared with a theory {theory.shape}",
+            possible="curves of the same length",
         )
     theory_fit = fit_sine(theory, interval_s, harmonics=harmonics)
     check_finite(measured, "the measured curve")
@@ -186,7 +187,7 @@ def _check_curve(values: NDArray[np.float64], interval_s: float, harmonics: int)
     if values.ndim != 1 or harmonics < 1 or len(values) < least:
         raise UsageError(
             f"a sinusoid with {harmonics} harmonics cannot be fitted to {values.shape} values",
-            possible=f"a curve (t,) of at least {least} values, 1 harmonic or more",
+            possible=f"a curve (t,) of at least {least} values, and 1 harmonic or more",
         )
     if not (np.isfinite(interval_s) and interval_s > 0):
         raise UsageError(
@@ -203,7 +204,7 @@ def _spectrum_peak(values: NDArray[np.float64], interval_s: float) -> float:
 
 
 def _visible_harmonics(frequency_hz: float, interval_s: float, harmonics: int) -> int:
-    """How many multiples of the frequency lie below half the sampling rate; UsageError for none."""
+    """Return the number of harmonics below half the sampling rate. Raises UsageError if there is none."""
     nyquist_hz = 0.5 / interval_s
     if not 0 < frequency_hz < nyquist_hz:
         raise UsageError(
@@ -216,7 +217,7 @@ def _visible_harmonics(frequency_hz: float, interval_s: float, harmonics: int) -
 def _refine(
     values: NDArray[np.float64], times_s: NDArray[np.float64], start_hz: float, harmonics: int
 ) -> tuple[float, int]:
-    """The frequency of the smallest residual within one lobe of ``start_hz``, and the harmonics fitted."""
+    """Return the frequency with the smallest residual within a lobe of ``start_hz``, and the harmonics."""
     interval_s = times_s[1]
     harmonics = _visible_harmonics(start_hz, interval_s, harmonics)
     lobe_hz = 1 / (len(values) * interval_s)
@@ -234,7 +235,7 @@ def _refine(
 def _project(
     values: NDArray[np.float64], times_s: NDArray[np.float64], frequency_hz: float, harmonics: int
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Coefficients (offset, p_1, q_1, p_2, …) of the best fit at this frequency, and the residual (t,)."""
+    """Return the coefficients (offset, p_1, q_1, p_2, …) of the fit at a frequency, and the residual (t,)."""
     angle = 2 * np.pi * frequency_hz * times_s
     columns = [np.ones_like(angle)]
     for k in range(1, harmonics + 1):

@@ -1,4 +1,4 @@
-"""Where a video is likely to be wrong: its estimated error by regions, beside a frame."""
+"""The map of a video's estimated error: its regions next to a frame."""
 
 from __future__ import annotations
 
@@ -15,13 +15,15 @@ if TYPE_CHECKING:
     from acquire.store import VideoFile
 
 MOST_FRAMES = 500
-"""That a map is made of; a video may have any number."""
+"""Largest number of frames that a map averages; a video may have any number."""
 HEIGHT_IN = 2.35
 
 
 def draw_error(file: VideoFile) -> Drawing | None:
-    """The frame in the middle of the trusted ones, and the error of its regions over all of these; None where
-    nothing is known of it."""
+    """Draw the middle one of the trusted frames and the error of the regions over all of them.
+
+    Return None if the error is not known.
+    """
     shown = range(len(file.time_ns)) if file.trusted is None else file.trusted
     full_scale = ((file.attrs.get("provenance") or {}).get("error") or {}).get("full_scale")
     if file.error is None or not shown or not full_scale:
@@ -35,18 +37,18 @@ def draw_error(file: VideoFile) -> Drawing | None:
         left, right = figure.subplots(1, 2)
         rows, columns = frame.shape
         left.imshow(frame, cmap="gray", vmin=0, vmax=full_scale)
-        left.set_title("a frame")
-        seen = right.imshow(percent, cmap="viridis", vmin=0, extent=(0, columns, rows, 0))
+        left.set_title("frame")
+        image = right.imshow(percent, cmap="viridis", vmin=0, extent=(0, columns, rows, 0))
         right.set_title("error (%)")
         for ax in (left, right):
             ax.set(xticks=[], yticks=[])
             ax.spines[:].set_visible(False)
-        figure.colorbar(seen, ax=right, shrink=0.8)
+        figure.colorbar(image, ax=right, shrink=0.8)
         return drawing_of(figure, narrow_in=HEIGHT_IN)
 
 
 def error_of_regions(file: VideoFile, frames: range) -> NDArray[np.float64]:
-    """RMS over frames (region_y, region_x); NaN where it is not known."""
+    """Return the RMS of the error over frames (region_y, region_x); NaN where it is not known."""
     assert file.error is not None
     every = max(1, len(frames) // MOST_FRAMES)
     found = np.asarray(file.error[frames.start : frames.stop : every], np.float64)

@@ -1,8 +1,8 @@
-"""The figures of the report, after Fig. 9 of the paper: line streams, frames, curves, error over time.
+"""The figures of the report, modelled on Fig. 9 of the paper: line streams, frames, curves, PSNR over time.
 
 Each function makes one matplotlib ``Figure`` from a :class:`~acquire.evaluate.result.DemoResult`;
-:func:`save_figures` writes all of them as PNG and SVG. This and `themed` are
-imported late, so that no command pays for matplotlib which draws nothing.
+:func:`save_figures` writes all of them as PNG and SVG. This module and `themed` are imported late, so that
+commands without figures do not import matplotlib.
 """
 
 from __future__ import annotations
@@ -41,14 +41,14 @@ FRAME_COLUMNS = 6
 DETAIL_PERIODS = 3
 DETAIL_SHARE = 0.1
 ERROR_SHARE = 0.5
-"""The error's scale ends at this share of the peak."""
+"""The scale of the error ends at this share of the peak."""
 
 NARROW_LINES_IN, NARROW_FRAMES = 3.4, 0.5
-"""On narrow pages: the height of the lines' picture; of the frames' as a share of that on a wide page."""
+"""On narrow pages: the height of the figure of lines, and the relative height of the figure of frames."""
 
 
 def save_figures(result: DemoResult, directory: Path) -> dict[str, Drawing]:
-    """Write lines, frames, curves (where there are regions) and psnr as PNG and SVG; name -> drawing."""
+    """Write lines, frames, curves (if there are regions) and psnr as PNG and SVG; return name → drawing."""
     makers = {"lines": line_streams, "frames": frames, "curves": intensity_curves, "psnr": psnr_over_time}
     if not result.regions:
         del makers["curves"]
@@ -62,7 +62,7 @@ def save_figures(result: DemoResult, directory: Path) -> dict[str, Drawing]:
 
 
 def line_streams(result: DemoResult) -> Figure:
-    """Both arms' lines as pictures, time downwards (Fig. 9a); samples that are masked stand out in colour."""
+    """Draw both arms' lines as pictures, with time downwards (Fig. 9a) and masked samples in colour."""
     segment, times = result.segment, result.line_ms
     figure = canvas(4.6)
     axes = figure.subplots(1, 2, sharey=True, squeeze=False)[0]
@@ -86,7 +86,7 @@ def line_streams(result: DemoResult) -> Figure:
 
 
 def frames(result: DemoResult) -> Figure:
-    """Representative frames (Fig. 9b): the truth, then each solver above its absolute error."""
+    """Draw representative frames (Fig. 9b): the truth, then each solver above its absolute error."""
     rows = [("truth", result.truth, False)]
     for solver in result.solvers:
         error = np.abs(solver.video - result.truth)
@@ -107,7 +107,10 @@ def frames(result: DemoResult) -> Figure:
 
 
 def intensity_curves(result: DemoResult) -> Figure:
-    """Mean intensity of each region against theory (Fig. 9c): where, the whole, a few periods, the fits."""
+    """Plot the mean intensity of each region against theory (Fig. 9c).
+
+    Each row shows the region, the whole curve, a detail of a few periods, and the fits.
+    """
     figure = canvas(0.7 + 1.45 * len(result.regions))
     axes = figure.subplots(len(result.regions), 3, squeeze=False, width_ratios=[1, 4.6, 2.1])
     for row, (where, whole, detail) in enumerate(axes):
@@ -130,7 +133,7 @@ def intensity_curves(result: DemoResult) -> Figure:
 
 
 def psnr_over_time(result: DemoResult) -> Figure:
-    """PSNR of each frame for every solver, with the PSNR of the whole video as a dashed line."""
+    """Plot the PSNR of each frame for every solver, and the PSNR of the whole video as a dashed line."""
     figure = canvas(2.9)
     ax = figure.subplots()
     for solver, colour in _coloured(result):
@@ -144,7 +147,7 @@ def psnr_over_time(result: DemoResult) -> Figure:
 
 
 def representative_frames(result: DemoResult, count: int = FRAME_COLUMNS) -> NDArray[np.int64]:
-    """Indices (count,) spread over one period of the slowest region; over the whole video without one."""
+    """Return indices (count,) spread over one period of the slowest region, or else over the whole video."""
     total = len(result.frame_ms)
     rates = [curve.theory.frequency_hz for curve in result.solvers[0].curves if not curve.constant]
     period = round(1e6 / (min(rates) * result.frame_interval_us)) if rates else 0
@@ -155,7 +158,7 @@ def representative_frames(result: DemoResult, count: int = FRAME_COLUMNS) -> NDA
 
 
 def _detail_window(result: DemoResult, row: int) -> tuple[float, float]:
-    """A few periods of this region about the middle of the video, in ms."""
+    """Return the limits of a few periods of this region around the middle of the video, in ms."""
     first, last = result.frame_ms[0], result.frame_ms[-1]
     curve = result.solvers[0].curves[row]
     share_ms = DETAIL_SHARE * (last - first)
@@ -187,18 +190,18 @@ def _show_region(ax: Axes, result: DemoResult, region: Region) -> None:
 
 def _plot_curves(ax: Axes, result: DemoResult, row: int) -> None:
     region = result.regions[row]
-    # What the figure shows as 1: theory and measurement share it, so that a lost amplitude is seen.
+    # theory and measurement share one scale, so that a lost amplitude shows
     scale = float(np.max(np.abs(region.theory))) or 1.0
     ax.plot(result.frame_ms, region.theory / scale, color=THEORY, lw=3.0, label="theory")
     for rank, (solver, colour) in enumerate(_coloured(result)):
         measured = region_mean(solver.video, region.mask) / scale
-        # the default solver comes first in the legend and lies on top
+        # the default solver comes first in the legend and is drawn on top
         ax.plot(result.frame_ms, measured, color=colour, lw=1.0, label=solver.label, zorder=3 - 0.1 * rank)
     ax.set_ylim(min(0.0, ax.get_ylim()[0]), max(1.05, ax.get_ylim()[1]))
 
 
 def _list_fits(ax: Axes, result: DemoResult, row: int) -> None:
-    """Right of the axes: what was set, and below it each solver's fit in the solver's colour."""
+    """Write the set frequency to the right of the axes, and each solver's fit below it in its colour."""
     set_hz = result.regions[row].set_hz
     texts = [("constant" if set_hz is None else f"set {set_hz:.0f} Hz", INK)]
     texts += [(_fit_text(solver.curves[row]), colour) for solver, colour in _coloured(result)]
@@ -219,7 +222,7 @@ def _coloured(result: DemoResult) -> list[tuple[Any, str]]:
 
 
 def bare(ax: Axes) -> None:
-    """A picture without ticks and frame."""
+    """Remove ticks, grid and frame from a picture."""
     ax.set(xticks=[], yticks=[])
     ax.grid(visible=False)
     for spine in ax.spines.values():
@@ -227,5 +230,5 @@ def bare(ax: Axes) -> None:
 
 
 def stamp(ax: Axes, text: str) -> None:
-    """Time above a picture."""
+    """Write the time above a picture."""
     ax.set_title(text, fontsize=7.5, fontweight="normal", pad=3)

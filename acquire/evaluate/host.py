@@ -1,4 +1,4 @@
-"""How busy the machine was while something was measured: a time says little without it."""
+"""The load of the machine during a measurement, without which a measured time means little."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from acquire.cores import slowness, usable_cores
 
 @dataclass(frozen=True, slots=True)
 class Busyness:
-    """``cores`` that the process may use; ``load`` is the mean of the load averages of a minute.
+    """Load of the machine: the ``cores`` that the process may use, and the mean one-minute ``load`` average.
 
-    ``share`` of a core is what a thread got that wanted a whole one: the median, and ``least_share``.
+    ``share`` is the median share of a core that a busy thread got, ``least_share`` the smallest.
     """
 
     cores: int
@@ -22,7 +22,7 @@ class Busyness:
     least_share: float
 
     def facts(self) -> dict[str, float]:
-        """As a page and its summary tell it."""
+        """Return the numbers for a page and its summary."""
         return {
             "cores": self.cores,
             "load": round(self.load, 1),
@@ -33,18 +33,18 @@ class Busyness:
 
 @dataclass(slots=True)
 class HostWatch:
-    """Looks at the machine between what is measured, so that it does not see the measured work itself."""
+    """Samples the load between measurements, so that the measured work itself is not counted."""
 
     _loads: list[float] = field(default_factory=list)
     _shares: list[float] = field(default_factory=list)
 
     def look(self) -> None:
-        """Takes a core for some hundredths of a second."""
+        """Take a sample, which occupies a core for a few hundredths of a second."""
         self._loads.append(os.getloadavg()[0])
         self._shares.append(1 / slowness())
 
     def busyness(self) -> Busyness:
-        """What was seen; looks now where nobody has looked yet."""
+        """Summarise the samples; take one now if there are none yet."""
         if not self._loads:
             self.look()
         return Busyness(usable_cores(), fmean(self._loads), median(self._shares), min(self._shares))

@@ -1,7 +1,7 @@
-"""Repeated runs as one curve with its band, and what is worth saying of it: where more time stops paying.
+"""Repeated runs as one curve with a band, and sentences about the point where more time stops paying off.
 
-An answer stands until the next: a curve is a staircase, level after the last answer. A *knee* is where
-doubling the time begins to buy less than `STEEP_DB`.
+A result holds until the next one, so a curve is a staircase that stays level after the last result. A *knee*
+is where doubling the time begins to gain less than `STEEP_DB`.
 """
 
 from __future__ import annotations
@@ -22,14 +22,14 @@ if TYPE_CHECKING:
 Clock = Literal["seconds", "processor_s"]
 
 STEEP_DB = 3.0
-"""Half the error's power: what a doubling of the time must buy to be worth a sentence's "next"."""
+"""Gain that makes doubling the time worthwhile: it halves the power of the error."""
 LOST_DB = 1.0
-"""Below its best, what an end is said to have lost."""
+"""A run that ends this far below its best result is reported to have lost accuracy."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Band:
-    """A quantity at ``times_s`` over repeats: lowest, median and highest, from when all have an answer."""
+    """Lowest, median and highest value of a quantity over the repeats, once all of them have a result."""
 
     times_s: NDArray[np.float64]
     low: NDArray[np.float64]
@@ -37,24 +37,24 @@ class Band:
     high: NDArray[np.float64]
 
     def at(self, seconds: float) -> float:
-        """The median after so long; that of the ends beyond them."""
+        """Return the median at a time; outside the curve, its first or last value."""
         place = int(np.searchsorted(self.times_s, seconds * (1 + 1e-9), "right")) - 1
         return float(self.middle[max(place, 0)])
 
 
 @dataclass(frozen=True, slots=True)
 class Knee:
-    """After ``seconds`` there are ``value``; as long again buys ``gain`` more, or all that is left."""
+    """``value`` is reached after ``seconds``; the same time again, or the rest, adds only ``gain``."""
 
     seconds: float
     value: float
     gain: float
     last: bool
-    """The run ended by itself before twice the time."""
+    """The run ended normally before twice this time."""
 
 
 def band(runs: Sequence[Run], name: str, clock: Clock = "seconds") -> Band | None:
-    """A quantity of all repeats over the wall's or the processor's time; None where it is not known."""
+    """Return a quantity of all repeats over the wall or processor time; None if it is not known."""
     stairs = []
     for run in runs:
         known = [(getattr(each, clock), getattr(each, name)) for each in run.points]
@@ -72,9 +72,10 @@ def band(runs: Sequence[Run], name: str, clock: Clock = "seconds") -> Band | Non
 
 
 def knees(curve: Band, *, ended: bool) -> list[Knee]:
-    """Where doubling the time stops paying; ``ended``: by itself, so that there is nothing after the end.
+    """Return the points where doubling the time stops paying off.
 
-    What stops before it has begun to climb is no knee, unless it never climbs.
+    ``ended`` states that the runs ended normally, so that there is nothing to gain after the end. A flat part
+    before the curve begins to rise is not a knee, unless the curve never rises.
     """
     end, first = float(curve.times_s[-1]), float(curve.middle[0])
     found: list[Knee] = []
@@ -92,44 +93,44 @@ def knees(curve: Band, *, ended: bool) -> list[Knee]:
 
 
 def sentences(runs: Sequence[Run]) -> list[str]:
-    """What the time of one solver, preset and dtype buys, in words; nothing where the truth is not known."""
+    """Describe what the time gains for one solver, preset and dtype; empty if the truth is not known."""
     curve = band(runs, "psnr_db")
     if curve is None:
         return []
     name, end = f"{runs[0].solver}, {runs[0].preset}", float(curve.times_s[-1])
     cut = any(run.cut for run in runs)
-    found = [_in_words(knee, end) for knee in knees(curve, ended=not cut)]
+    found = [_sentence(knee, end) for knee in knees(curve, ended=not cut)]
     best = int(np.argmax(curve.middle))
     if (lost := float(curve.middle[best] - curve.middle[-1])) >= LOST_DB:
         found.append(
             f"best after {plain(curve.times_s[best])} s with {curve.middle[best]:.0f} dB; "
-            f"going on to {plain(end)} s loses {lost:.0f}"
+            f"continuing to {plain(end)} s loses {lost:.0f} dB"
         )
     if not cut:
         return [f"{name}: {each}." for each in found]
     climbed = curve.at(end) - curve.at(end / 2)
     rest = (
-        f"cut by its budget after {plain(end)} s with {curve.at(end):.0f} dB; "
-        f"the second half of that time bought {_amount(climbed)}"
+        f"cut by its time limit after {plain(end)} s with {curve.at(end):.0f} dB; "
+        f"the second half of that time gained {_amount(climbed)}"
     )
     return [f"{name}: {each}." for each in [*found, rest]]
 
 
-def _in_words(knee: Knee, end_s: float) -> str:
-    bought = f"{plain(knee.seconds)} s buy {knee.value:.0f} dB"
+def _sentence(knee: Knee, end_s: float) -> str:
+    reached = f"{plain(knee.seconds)} s give {knee.value:.0f} dB"
     if knee.last and end_s <= 1.02 * knee.seconds:
-        return f"{bought}, and there it ends"
+        return f"{reached}, where the run ends"
     if knee.last:
-        return f"{bought}; the rest, to {plain(end_s)} s, buys {_amount(knee.gain)}"
-    return f"{bought}; the next {plain(knee.seconds)} s buy {_amount(knee.gain)}"
+        return f"{reached}; the rest, to {plain(end_s)} s, adds {_amount(knee.gain)}"
+    return f"{reached}; the next {plain(knee.seconds)} s add {_amount(knee.gain)}"
 
 
 def _amount(decibel: float) -> str:
-    return f"{decibel:.0f} more" if decibel >= 0.5 else "nothing"
+    return f"{decibel:.0f} dB" if decibel >= 0.5 else "nothing"
 
 
 def plain(seconds: float) -> str:
-    """Two digits, without an exponent: 0.85, 15, 120."""
+    """Format a time with two digits and without an exponent: 0.85, 15, 120."""
     if seconds <= 0:
         return "0"
     digits = 1 - math.floor(math.log10(seconds))

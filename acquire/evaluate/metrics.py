@@ -1,7 +1,7 @@
-"""How far a video is from the truth: PSNR and SSIM, whole and per frame, in float64.
+"""PSNR and SSIM of a video against the truth, for the whole video and per frame, in float64.
 
-Both compare ``(time, row, column)`` arrays (one picture ``(row, column)`` is a video of one frame) and
-take the peak, the brightest value that the scene can have, from the truth unless it is given.
+Both compare ``(time, row, column)`` arrays; one picture ``(row, column)`` is a video of one frame. The peak,
+the brightest value that the scene can have, is the truth's maximum unless it is given.
 """
 
 from __future__ import annotations
@@ -20,15 +20,15 @@ SSIM_SIGMA = 1.5
 """Standard deviation of the Gaussian window in pixels (Wang et al. 2004, Section III.C)."""
 SSIM_TRUNCATE = 3.5
 SSIM_RADIUS = int(SSIM_TRUNCATE * SSIM_SIGMA + 0.5)
-"""The window reaches 5 pixels to each side; a border of that width is left out of the mean."""
+"""The window extends 5 pixels to each side; a border of that width is left out of the mean."""
 SSIM_K1, SSIM_K2 = 0.01, 0.03
 
 
 def psnr(video: NDArray[Any], truth: NDArray[Any], peak: float | None = None) -> float:
-    """10·log10(peak² / mean squared error) in dB over all voxels; ``inf`` for equal arrays.
+    """Return 10·log10(peak² / mean squared error) in dB over all voxels; ``inf`` for equal arrays.
 
-    ``peak`` is the truth's maximum unless given. Raises UsageError for shapes that differ or a peak that
-    is not positive, NumericsError for values that are not finite.
+    ``peak`` is the truth's maximum unless given. Raises UsageError for different shapes or a peak that is not
+    positive, NumericsError for values that are not finite.
     """
     video, truth = check_pair(video, truth)
     error = _mean_squared_error(video, truth)
@@ -38,7 +38,7 @@ def psnr(video: NDArray[Any], truth: NDArray[Any], peak: float | None = None) ->
 def psnr_per_frame(
     video: NDArray[Any], truth: NDArray[Any], peak: float | None = None
 ) -> NDArray[np.float64]:
-    """PSNR of each frame (t,) in dB against one common peak; raises as :func:`psnr`."""
+    """Return the PSNR of each frame (t,) in dB, all with the same peak; raises as :func:`psnr`."""
     video, truth = check_pair(video, truth)
     pairs = zip(video, truth, strict=True)
     errors = np.array([_mean_squared_error(frame, true_frame) for frame, true_frame in pairs])
@@ -46,7 +46,7 @@ def psnr_per_frame(
 
 
 def ssim(video: NDArray[Any], truth: NDArray[Any], data_range: float | None = None) -> float:
-    """Mean over the frames of the structural similarity, 1 for equal frames (Wang et al. 2004).
+    """Return the mean structural similarity of the frames, 1 for equal frames (Wang et al. 2004).
 
     ``data_range`` is the truth's maximum unless given. Raises as :func:`psnr`, and UsageError for frames
     smaller than the 11 x 11 window.
@@ -57,7 +57,7 @@ def ssim(video: NDArray[Any], truth: NDArray[Any], data_range: float | None = No
 def ssim_per_frame(
     video: NDArray[Any], truth: NDArray[Any], data_range: float | None = None
 ) -> NDArray[np.float64]:
-    """Structural similarity of each frame (t,); raises as :func:`ssim`."""
+    """Return the structural similarity of each frame (t,); raises as :func:`ssim`."""
     video, truth = check_pair(video, truth)
     window = 2 * SSIM_RADIUS + 1
     if min(video.shape[1:]) < window:
@@ -66,17 +66,20 @@ def ssim_per_frame(
             possible=f"at least {window} x {window} pixels",
         )
     peak = checked_peak(truth, data_range)
-    # frame by frame: the five filtered moments of a whole video would be five more videos in memory
+    # frame by frame, because the five filtered moments of a whole video would need five times its memory
     return np.array([_ssim_frame(x, y, peak) for x, y in zip(video, truth, strict=True)])
 
 
 def check_pair(video: NDArray[Any], truth: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:
-    """Both as (time, row, column); UsageError unless the shapes agree, NumericsError unless all is finite."""
+    """Return both as (time, row, column).
+
+    Raises UsageError if the shapes differ, NumericsError if a value is not finite.
+    """
     video, truth = np.asarray(video), np.asarray(truth)
     if video.shape != truth.shape or video.ndim not in {2, 3} or video.size == 0:
         raise UsageError(
             f"a video {video.shape} cannot be compared with a truth {truth.shape}",
-            possible="two arrays of one shape (time, row, column) or (row, column)",
+            possible="two arrays of the same shape, (time, row, column) or (row, column)",
         )
     check_finite(video, "the video")
     check_finite(truth, "the truth")
@@ -84,14 +87,14 @@ def check_pair(video: NDArray[Any], truth: NDArray[Any]) -> tuple[NDArray[Any], 
 
 
 def check_finite(values: NDArray[Any], what: str) -> None:
-    """Raise NumericsError that counts the values which are not finite."""
+    """Raise NumericsError if values are not finite; its message counts them."""
     bad = values.size - np.count_nonzero(np.isfinite(values))
     if bad:
         raise NumericsError(f"{bad} of {values.size} values of {what} are not finite")
 
 
 def checked_peak(truth: NDArray[Any], peak: float | None = None) -> float:
-    """``peak``, or the truth's maximum; UsageError unless it is positive and finite."""
+    """Return ``peak``, or the truth's maximum. Raises UsageError unless it is positive and finite."""
     value = float(np.max(truth)) if peak is None else float(peak)
     if not (np.isfinite(value) and value > 0):
         raise UsageError(f"the peak of a comparison cannot be {value}", possible="a positive number")
@@ -109,7 +112,7 @@ def _decibel(errors: NDArray[np.float64], peak: float) -> NDArray[np.float64]:
 
 
 def _local_mean(image: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Gaussian-weighted mean about each pixel whose window lies inside the image."""
+    """Return the Gaussian-weighted mean around each pixel whose window lies inside the image."""
     smooth: NDArray[np.float64] = gaussian_filter(image, SSIM_SIGMA, truncate=SSIM_TRUNCATE)
     return smooth[SSIM_RADIUS:-SSIM_RADIUS, SSIM_RADIUS:-SSIM_RADIUS]
 

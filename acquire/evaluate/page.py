@@ -1,4 +1,4 @@
-"""Pages that are one file: pictures, style and script are inside, and nothing outside is referred to."""
+"""Pages in a single file, with pictures, style and script inside and no external references."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ MINUS = "\N{MINUS SIGN}"
 
 
 def fill_template(template: str, facts: Mapping[str, Any], drawings: Mapping[str, Drawing]) -> str:
-    """A page out of a template of ours; the drawings become ``images`` by the same names."""
+    """Fill one of our templates; the drawings become ``images`` of the same names."""
     environment = jinja2.Environment(
         loader=jinja2.PackageLoader("acquire.evaluate"),
         autoescape=True,
@@ -34,7 +34,7 @@ def fill_template(template: str, facts: Mapping[str, Any], drawings: Mapping[str
 
 
 def svg_uri(svg: str) -> str:
-    """Drawings and pictures as ``data:`` URIs."""
+    """Return a drawing as a ``data:`` URI."""
     return _data_uri("image/svg+xml", svg.encode())
 
 
@@ -47,9 +47,9 @@ def _data_uri(media_type: str, content: bytes) -> str:
 
 
 def number(value: float | None, digits: int | None = None, *, signed: bool = False) -> str:
-    """A number as the page shows it: thousands apart, a true minus sign, an en dash for None.
+    """Format a number for a page: with grouped thousands, a true minus sign, and an en dash for None.
 
-    Without ``digits`` a float shows as many as it has, none for a whole one.
+    Without ``digits`` a float is shown with all its digits, and a whole one without decimals.
     """
     if value is None:
         return "–"
@@ -60,7 +60,7 @@ def number(value: float | None, digits: int | None = None, *, signed: bool = Fal
 
 
 def hertz(value: float | None) -> str:
-    """A frequency that somebody set: ``5 kHz``, ``30 Hz``, or ``constant``."""
+    """Format a frequency that was set: ``5 kHz``, ``30 Hz``, or ``constant``."""
     if value is None:
         return "constant"
     return f"{value / 1e3:g}{NARROW_SPACE}kHz" if value >= 1e3 else f"{value:g}{NARROW_SPACE}Hz"

@@ -1,4 +1,4 @@
-"""Videos for the player of a page: frame by frame, as small as they are; the page enlarges them."""
+"""Videos for the player of a page: separate frames in their original size, which the page enlarges."""
 
 from __future__ import annotations
 
@@ -22,7 +22,10 @@ QUALITY = 88
 
 
 def beside(panels: Sequence[NDArray[Any]], peak: float, height_px: int | None = None) -> Image.Image:
-    """Frames (row, column) side by side; 0 is black, ``peak`` white. As high as the highest if not told."""
+    """Draw frames (row, column) side by side, from 0 (black) to ``peak`` (white).
+
+    The height is ``height_px``, or that of the highest frame.
+    """
     height = height_px or max(len(panel) for panel in panels)
     greys = [grey(panel, peak, height) for panel in panels]
     gap = max(1, height // 24)
@@ -36,7 +39,7 @@ def beside(panels: Sequence[NDArray[Any]], peak: float, height_px: int | None = 
 
 @dataclass(frozen=True, slots=True)
 class Clip:
-    """Every ``step``-th picture as a URI; ``start`` is the one of most contrast, for who sees only one."""
+    """Every ``step``-th picture as a URI; ``start`` has the most contrast, and is shown first."""
 
     frames: list[str]
     step: int
@@ -44,7 +47,7 @@ class Clip:
 
 
 def clip_of(pictures: Sequence[Image.Image], max_bytes: int = MAX_BYTES) -> Clip:
-    """The pictures as WebP, every second left out until they keep to ``max_bytes``."""
+    """Encode the pictures as WebP; every second one is dropped until they fit into ``max_bytes``."""
     frames, step = [webp(picture, QUALITY) for picture in pictures], 1
     while len(frames) > 2 and sum(map(len, frames)) > max_bytes:
         frames, step = frames[::2], 2 * step

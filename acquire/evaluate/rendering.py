@@ -1,7 +1,7 @@
-"""Videos as people watch them: MP4, GIF, WebP, one PNG sheet of frames, or a page; several side by side.
+"""Renderings of videos: MP4, GIF, WebP, a PNG sheet of frames, or a page, with several videos side by side.
 
-Every panel shows the frame of its own video at the common time, so that other voxels of the same lines (a
-selective reconstruction) run together. Grey is linear from 0 to ``peak``.
+Every panel shows the frame of its own video at the common time, so that videos with different voxels of the
+same lines (selective reconstruction) run in step. Grey is linear from 0 to ``peak``.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ SUFFIXES = (".mp4", ".gif", ".webp", ".png", ".html")
 
 @dataclass(frozen=True, slots=True)
 class Look:
-    """How a rendering looks. ``panel_px`` is the height of a panel, ``peak`` white (None: from the video)."""
+    """Appearance of a rendering: panel height, value of white (None: from the video), frame rate, labels."""
 
     panel_px: int = 384
     peak: float | None = None
@@ -43,28 +43,28 @@ class Look:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Panel:
-    """One video of a rendering."""
+    """One video in a rendering."""
 
     name: str
     file: VideoFile
 
     def at(self, time_ns: int) -> NDArray[Any]:
-        """The frame that is shown at a time."""
+        """Return the frame shown at a time."""
         frame: NDArray[Any] = np.asarray(self.file.video[self.index(time_ns)])
         return frame
 
     def index(self, time_ns: int) -> int:
-        """Its number."""
+        """Return the number of the frame shown at a time."""
         index = int(np.searchsorted(self.file.time_ns, time_ns, "right")) - 1
         return min(max(index, 0), self.file.video.shape[0] - 1)
 
 
 def check_suffix(path: Path) -> None:
-    """Raise UsageError for a file name that says none of `SUFFIXES`."""
+    """Raise UsageError if the suffix of a file name is none of `SUFFIXES`."""
     if path.suffix.lower() not in SUFFIXES:
         raise UsageError(
             f"{path} cannot be rendered: "
-            + (f"{path.suffix} is no format that is known" if path.suffix else "its name has no suffix"),
+            + (f"{path.suffix} is not a known format" if path.suffix else "its name has no suffix"),
             possible=".mp4 (a movie), .gif or .webp (an animation), .png (a sheet of stills), "
             ".html (a page with a player)",
             hint=f"--out {path.with_suffix('.mp4')}",
@@ -72,9 +72,10 @@ def check_suffix(path: Path) -> None:
 
 
 def common_times(panels: Sequence[Panel], count: int) -> NDArray[np.int64]:
-    """At most ``count`` instants, equally spaced, at which frames of the finest panel begin and all have one.
+    """Return up to ``count`` equally spaced instants at which the finest panel has a new frame and all have
+    one.
 
-    UsageError when the videos have no time in common.
+    Raises UsageError if the videos have no time in common.
     """
     finest = min(panels, key=lambda panel: panel.file.interval_ns).file.time_ns
     begin = max(int(panel.file.time_ns[0]) for panel in panels)
@@ -83,7 +84,7 @@ def common_times(panels: Sequence[Panel], count: int) -> NDArray[np.int64]:
     if not len(times):
         raise UsageError(
             "the videos have no time in common, so they cannot be shown side by side",
-            hint="each of them by itself",
+            hint="one page or movie for each of them",
         )
     step = -(-len(times) // max(1, count))
     chosen: NDArray[np.int64] = times[::step]
@@ -97,45 +98,37 @@ def render(
     count: int,
     progress: Callable[[int, int], object] | None = None,
 ) -> int:
-    """Write ``count`` frames or fewer, as ``path``'s suffix says; the number of them.
+    """Write up to ``count`` frames in the format of ``path``'s suffix; return their number.
 
-    UsageError as `check_suffix`, or for MP4 without the extra it needs.
+    Raises UsageError as `check_suffix`, and for MP4 if its extra is not installed.
     """
     check_suffix(path)
     times = common_times(panels, count)
     peaks = [look.peak or _peak(panel) for panel in panels]
     if path.suffix.lower() == ".html":
-        from acquire.evaluate.video_page import write_page  # which draws, and so costs more
+        from acquire.evaluate.video_page import write_page  # imports matplotlib, which is slow
 
         return write_page(panels, peaks, times, path=path, look=look, progress=progress)
-    pictures = _pictures(panels, times, peaks, look, progress)
+    stamps = [f"{(time_ns - int(times[0])) / 1e6:.3f} ms" if look.label else "" for time_ns in times.tolist()]
+
+    def pictures() -> Iterator[Image.Image]:
+        for number, time_ns in enumerate(times.tolist()):
+            yield _picture(panels, [panel.at(time_ns) for panel in panels], peaks, look, stamps[number])
+            if progress is not None:
+                progress(number + 1, len(times))
+
     match path.suffix.lower():
         case ".png":
-            _sheet(list(pictures)).save(path)
+            _sheet(list(pictures())).save(path)
         case ".mp4":
-            _write_mp4(path, pictures, look.fps)
+            _write_mp4(path, pictures(), look.fps)
         case ".webp":
-            write_webp(path, list(pictures), round(1000 / look.fps))
+            write_webp(path, list(pictures()), round(1000 / look.fps))
         case ".gif":
-            first, *rest = pictures
+            first, *rest = pictures()
             duration = round(1000 / look.fps)
             first.save(path, save_all=True, append_images=rest, duration=duration, loop=0, optimize=False)
     return len(times)
-
-
-def _pictures(
-    panels: Sequence[Panel],
-    times: NDArray[np.int64],
-    peaks: Sequence[float],
-    look: Look,
-    progress: Callable[[int, int], object] | None,
-) -> Iterator[Image.Image]:
-    start = int(times[0])
-    for number, time_ns in enumerate(times.tolist()):
-        stamp = f"{(time_ns - start) / 1e6:.3f} ms" if look.label else ""
-        yield _picture(panels, [panel.at(time_ns) for panel in panels], peaks, look, stamp)
-        if progress is not None:
-            progress(number + 1, len(times))
 
 
 def _picture(
@@ -158,7 +151,7 @@ def _picture(
 
 
 def grey(frame: NDArray[Any], peak: float, height_px: int) -> Image.Image:
-    """A frame (row, column) as an 8-bit picture: 0 black, ``peak`` white; pixels stay square and sharp."""
+    """Draw a frame (row, column) in 8 bits, from 0 (black) to ``peak`` (white), with square, sharp pixels."""
     rows, columns = frame.shape
     values = np.clip(np.rint(frame * (255 / peak)), 0, 255).astype(np.uint8)
     enlarge = height_px >= 3 * rows
@@ -168,7 +161,7 @@ def grey(frame: NDArray[Any], peak: float, height_px: int) -> Image.Image:
 
 
 def _peak(panel: Panel) -> float:
-    """White of a video: nearly its brightest voxel, from a few frames."""
+    """Return the value of white for a video: close to its brightest voxel, from a few frames."""
     frames = panel.file.video.shape[0]
     some = np.unique(np.linspace(0, frames - 1, 12).astype(int))
     values = np.stack([np.asarray(panel.file.video[int(index)]) for index in some])
@@ -201,7 +194,7 @@ def _write_mp4(path: Path, pictures: Iterator[Image.Image], fps: float) -> None:
     with av.open(str(path), "w") as container:
         stream = container.add_stream("libx264", rate=Fraction(fps).limit_denominator(1000))
         stream.pix_fmt, stream.options = "yuv420p", {"crf": "18"}
-        # the codec halves the colours' resolution: it wants even sizes
+        # the codec halves the resolution of colours, so it needs even sizes
         stream.width, stream.height = (side - side % 2 for side in first.size)
         for picture in chain([first], pictures):
             container.mux(stream.encode(av.VideoFrame.from_ndarray(np.asarray(picture))))

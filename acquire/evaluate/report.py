@@ -1,8 +1,8 @@
-"""The report of a demonstration run: one HTML page that holds everything, and its pictures beside it.
+"""The report of a demo run: one HTML page with everything in it, and its pictures in the same directory.
 
-The page is rendered from :meth:`DemoResult.summary` alone, which is also written as ``summary.json``, so
-that page, file and command line state the same numbers. Pictures and style are inside the page: it can
-be sent to somebody as one file and refers to nothing outside.
+The page is rendered from :func:`summarise` alone, which is also written as ``summary.json``, so that page,
+file and command line state the same numbers. Pictures and style are embedded in the page, so it can be sent
+as a single file.
 """
 
 from __future__ import annotations
@@ -49,11 +49,11 @@ ANIMATION = "animation.webp"
 
 
 def write_report(result: DemoResult, directory: Path) -> Path:
-    """Write page, summary, figures and animation into ``directory`` (made if absent); returns the page.
+    """Write page, summary, figures and animation into ``directory`` (created if needed); return the page.
 
-    Files of an earlier report there are replaced. Raises UsageError when the directory cannot be made.
+    Files of an earlier report are replaced. Raises UsageError if the directory cannot be created.
     """
-    from acquire.evaluate import figures  # matplotlib costs more than everything else here together
+    from acquire.evaluate import figures  # importing matplotlib takes longer than everything else here
 
     try:
         directory.mkdir(parents=True, exist_ok=True)
@@ -62,7 +62,14 @@ def write_report(result: DemoResult, directory: Path) -> Path:
     drawings = figures.save_figures(result, directory)
     movie = directory / ANIMATION
     step = animation.save_animation(result, movie)
-    summary = summarise(result) | {"animation": _animation_facts(result, step)}
+    shown_ms = step * result.frame_interval_us / 1e3
+    facts = {
+        "file": ANIMATION,
+        "every": step,
+        "frames": len(range(0, len(result.frame_ms), step)),
+        "slowed_down": round(animation.FRAME_DURATION_MS / shown_ms),
+    }
+    summary = summarise(result) | {"animation": facts}
     (directory / SUMMARY).write_text(json.dumps(summary, indent=2, allow_nan=False) + "\n", encoding="utf-8")
     page = directory / PAGE
     page.write_text(render_page(summary, drawings, movie), encoding="utf-8")
@@ -70,19 +77,9 @@ def write_report(result: DemoResult, directory: Path) -> Path:
 
 
 def render_page(summary: dict[str, Any], drawings: dict[str, Drawing], movie: Path) -> str:
-    """The page as text: ``summary``, the drawings and the frames of the animation, which it takes in."""
+    """Return the page as text, with the summary, the drawings and the frames of the animation embedded."""
     frames = {
         "animation_frames": [webp_uri(each) for each in animation.stills(movie)],
         "frame_shown_ms": animation.FRAME_DURATION_MS,
     }
     return fill_template("report.html.j2", summary | frames, drawings)
-
-
-def _animation_facts(result: DemoResult, step: int) -> dict[str, Any]:
-    shown_ms = step * result.frame_interval_us / 1e3
-    return {
-        "file": ANIMATION,
-        "every": step,
-        "frames": len(range(0, len(result.frame_ms), step)),
-        "slowed_down": round(animation.FRAME_DURATION_MS / shown_ms),
-    }

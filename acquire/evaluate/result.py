@@ -1,7 +1,7 @@
-"""What a demonstration run found out: the facts behind the report, with nothing of how they are shown.
+"""The result of a demo run: the facts behind the report, independent of how they are shown.
 
-:class:`DemoResult` holds the arrays and facts of one run, checked against one another;
-:func:`evaluate_solver` makes what it needs of each reconstruction.
+:class:`DemoResult` holds the arrays and facts of one run and checks that they fit together;
+:func:`evaluate_solver` prepares each reconstruction for it.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class RigFacts:
-    """What took the recording. ``code`` and ``scene`` are one line of text each."""
+    """The rig of the recording. ``code`` and ``scene`` are one line of text each."""
 
     name: str
     code: str
@@ -39,11 +39,12 @@ class RigFacts:
 
 @dataclass(frozen=True, slots=True)
 class ArmLedger:
-    """What became of one arm's lines since it was armed.
+    """Account of one arm's lines since it was armed.
 
-    ``delivered`` by the camera, of which ``preroll`` were exposed before the start and ``discarded`` came
-    while nothing was recorded; ``lost`` by cause. The recording has ``recorded`` rows, of which ``missing``
-    hold no line. ``ring_peak`` of ``ring_slots`` blocks were waiting at the worst moment.
+    The camera ``delivered`` lines, of which ``preroll`` were exposed before the start and ``discarded``
+    arrived while nothing was recorded; ``lost`` counts lost lines by cause. The recording has ``recorded``
+    rows, of which ``missing`` hold no line. At most ``ring_peak`` of ``ring_slots`` blocks were waiting in
+    the ring.
     """
 
     delivered: int
@@ -62,7 +63,7 @@ class ArmLedger:
 
 @dataclass(frozen=True, slots=True)
 class CaptureFacts:
-    """The recording and how it came about; ``arms`` maps arm -> ledger."""
+    """The recording and how it was made; ``arms`` maps each arm to its ledger."""
 
     recording: Path
     condition: str
@@ -74,9 +75,10 @@ class CaptureFacts:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Region:
-    """An area whose intensity is followed: ``mask`` (row, column) bool, ``theory`` (t,) in the scene's units.
+    """An area whose intensity is evaluated: ``mask`` (row, column) bool, ``theory`` (t,) in the scene's
+    units.
 
-    ``set_hz`` is the frequency that the scene was asked for, None for a constant.
+    ``set_hz`` is the frequency set in the scene, None for a constant.
     """
 
     name: str
@@ -87,7 +89,7 @@ class Region:
 
 @dataclass(frozen=True, slots=True)
 class Stage:
-    """One step of the run and how long it took."""
+    """One step of the run and its duration."""
 
     name: str
     seconds: float
@@ -96,11 +98,11 @@ class Stage:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SolverResult:
-    """One reconstruction of the segment against the truth; :func:`evaluate_solver` makes it.
+    """One reconstruction of the segment, compared with the truth by :func:`evaluate_solver`.
 
-    ``video`` (t, row, column) and ``psnr_per_frame`` (t,) cover the trusted frames only;
-    ``curves`` has one entry per region. With fewer ``iterations`` than ``requested_iterations`` it was
-    stopped by ``budget_s``, and is not what the solver can do.
+    ``video`` (t, row, column) and ``psnr_per_frame`` (t,) cover the trusted frames only; ``curves`` has one
+    entry per region. With fewer ``iterations`` than ``requested_iterations`` the solver was stopped by
+    ``budget_s``, so the result does not show what it can reach.
     """
 
     label: str
@@ -127,7 +129,7 @@ def evaluate_solver(
     requested_iterations: int,
     budget_s: float | None = None,
 ) -> SolverResult:
-    """Compare the trusted frames of a reconstruction with the truth; raises as the metrics and fits do."""
+    """Compare the trusted frames of a reconstruction with the truth. Raises as the metrics and fits do."""
     return SolverResult(
         label=label,
         video=video,
@@ -149,11 +151,10 @@ def evaluate_solver(
 class DemoResult:
     """Everything that the report shows.
 
-    ``frame_time_ns`` (t,) are the UTC times of the trusted frames, which ``truth`` and every solver's
-    video hold; ``start_ns`` is the time of the recording's first line, from which the figures count.
-    ``solvers[0]`` is the default one, which the headline quotes; ``host`` is what the machine was like
-    meanwhile. Raises UsageError when the arrays do not
-    fit together.
+    ``frame_time_ns`` (t,) are the UTC times of the trusted frames, the frames of ``truth`` and of every
+    solver's video; ``start_ns`` is the time of the recording's first line, from which the figures count.
+    ``solvers[0]`` is the default solver, which the headline quotes; ``host`` is the load of the machine.
+    Raises UsageError if the arrays do not fit together.
     """
 
     title: str
@@ -176,7 +177,7 @@ class DemoResult:
         if self.truth.ndim != 3 or self.truth.shape[0] != frames or frames < 2:
             raise UsageError(
                 f"a report cannot have a truth {self.truth.shape} with {frames} time stamps",
-                possible="2 frames (time, row, column) or more, with a time stamp each",
+                possible="2 or more frames (time, row, column), with one time stamp each",
             )
         if not self.solvers:
             raise UsageError("a report needs a reconstruction", possible="one or more")
@@ -196,17 +197,17 @@ class DemoResult:
     def _check(what: str, found: tuple[Any, ...], expected: tuple[Any, ...]) -> None:
         if found != expected:
             raise UsageError(
-                f"a report cannot have {what} with {found}", possible=f"{expected}, as the truth has it"
+                f"a report cannot have {what} with {found}", possible=f"{expected}, like the truth"
             )
 
     @property
     def frame_ms(self) -> NDArray[np.float64]:
-        """Time of each frame since the recording's first line."""
+        """Time of each frame after the recording's first line."""
         return (self.frame_time_ns - self.start_ns) / 1e6
 
     @property
     def line_ms(self) -> NDArray[np.float64]:
-        """Time at which each line's read-out began, since the recording's first line."""
+        """Start of each line's read-out, after the recording's first line."""
         return (self.segment.time_ns - self.start_ns) / 1e6
 
     @property
@@ -215,5 +216,5 @@ class DemoResult:
 
     @property
     def peak(self) -> float:
-        """White of the figures: the brightest value of the truth."""
+        """Brightest value of the truth, which the figures show as white."""
         return metrics.checked_peak(self.truth)

@@ -1,7 +1,7 @@
-"""The numbers of a demonstration run, rounded once, for the page, ``summary.json`` and ``--json`` alike.
+"""The numbers of a demo run, rounded once, for the page, ``summary.json`` and ``--json`` alike.
 
-Every value is JSON-able and carries its unit in its name; None stands for what does not exist, such as
-the frequency of a constant, and for what is not finite, such as the PSNR of equal videos.
+All values can be written as JSON, and their names include the unit. None stands for values that do not exist,
+such as the frequency of a constant, and for values that are not finite, such as the PSNR of equal videos.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 
 def summarise(result: DemoResult) -> dict[str, Any]:
-    """All numbers of the report."""
+    """Return all numbers of the report."""
     set_hz = [region.set_hz for region in result.regions]
     return {
         "title": result.title,
@@ -54,7 +54,7 @@ def rig_summary(result: DemoResult) -> dict[str, Any]:
 
 
 def capture_summary(capture: CaptureFacts) -> dict[str, Any]:
-    """``recorded_lines`` and ``lost_lines`` add up both arms; a row without its line is not recorded."""
+    """Summarise a capture; ``recorded_lines`` and ``lost_lines`` are sums over both arms."""
     ledgers = capture.arms.values()
     return {
         "recording": str(capture.recording),
@@ -97,7 +97,7 @@ def segment_summary(result: DemoResult) -> dict[str, Any]:
 
 
 def span_voxels(result: DemoResult) -> float:
-    """Voxels of the segment's whole span T, of which the trusted frames are a part (S_r counts all of T)."""
+    """Return the number of voxels of the segment's whole span T, as S_r counts all of T."""
     span_us = result.segment.geometry.span * result.segment.substep_ns / 1e3
     rows, columns = result.truth.shape[1:]
     return float(rows * columns) * span_us / result.frame_interval_us
@@ -129,7 +129,7 @@ def curve_summary(curve: CurveComparison, set_hz: float | None) -> dict[str, Any
 
 
 def swing_summary(curve: CurveComparison) -> dict[str, float | None]:
-    """What only a curve that changes has; None for all of it where theory is constant."""
+    """Return the numbers that only a changing curve has; all are None if theory is constant."""
     values = {
         "measured_hz": rounded(curve.measured.frequency_hz, 1),
         "frequency_error_hz": rounded(curve.frequency_error_hz, 1),
@@ -143,7 +143,7 @@ def swing_summary(curve: CurveComparison) -> dict[str, float | None]:
 
 
 def rounded(value: float | None, digits: int) -> float | None:
-    """None for None and for what is not finite; never −0."""
+    """Round a value, without a negative zero; None for None and for values that are not finite."""
     if value is None or not math.isfinite(value):
         return None
     return round(float(value), digits) + 0.0

@@ -1,7 +1,6 @@
-"""Drawings for a page: SVG whose ink follows the reader's theme, for wide pages and for narrow ones.
+"""Drawings for a page: SVG with colours that follow the reader's theme, for wide and for narrow pages.
 
-From one figure come a PNG for elsewhere, and both shapes of the SVG: letters keep their size, and what lies
-between them is laid out anew.
+One figure gives a PNG and two shapes of the SVG: the text keeps its size, and the rest is laid out again.
 """
 
 from __future__ import annotations
@@ -20,7 +19,7 @@ if TYPE_CHECKING:
 
 DPI = 150
 WIDTH_IN, NARROW_IN = 10.0, 4.6
-"""Of a page, and of a telephone: at its width a letter is as large as the page's small print."""
+"""Width of a drawing on a page and on a phone, where its text is then as large as the small print."""
 
 INK, EDGE, GRID = "#1f2933", "#7b8794", "#e4e7eb"
 SOFT = "#52606d"
@@ -28,7 +27,7 @@ THEORY = "#9aa5b1"
 HIGHLIGHT = "#f0b429"
 MASKED = "#d55e00"
 SOLVER_COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7")
-"""Okabe and Ito's palette, which stays distinct under the common colour deficiencies."""
+"""Okabe and Ito's palette, which remains distinct with the common colour vision deficiencies."""
 
 DARK = {
     INK: "#e4e9ef",
@@ -41,7 +40,7 @@ DARK = {
     SOLVER_COLOURS[2]: "#2fcf9f",
     SOLVER_COLOURS[3]: "#e6a3cc",
 }
-"""Colours of drawings → those that take their place on a dark page."""
+"""Colours of drawings → their replacements on a dark page."""
 
 STYLE: Any = {
     "font.size": 9.5,
@@ -63,25 +62,25 @@ STYLE: Any = {
     "xtick.major.width": 0.7,
     "ytick.major.width": 0.7,
     "legend.frameon": False,
-    "image.interpolation": "none",  # a picture lies in the SVG pixel by pixel, and small
+    "image.interpolation": "none",  # keeps the pixels of a picture, so that it is small in the SVG
     "figure.facecolor": "white",
     "savefig.facecolor": "white",
 }
 
 ROOM_IN = 0.08
-"""Around the axes: twice the usual."""
+"""Padding around the axes: twice matplotlib's default."""
 SVG: Any = {"svg.fonttype": "none", "svg.hashsalt": "acquire", "font.family": "sans-serif"}
-"""Text stays text, in the reader's own font; the same figure gives the same file."""
+"""Text stays text, in the reader's own font; the same figure always gives the same file."""
 
 
 def canvas(height_in: float, width_in: float = WIDTH_IN) -> Figure:
-    """An empty figure without pyplot and its global state, with room for a reader's font that is larger."""
+    """Make an empty figure without pyplot's global state, with room for a larger font of the reader."""
     return Figure(figsize=(width_in, height_in), layout=ConstrainedLayoutEngine(w_pad=ROOM_IN, h_pad=ROOM_IN))
 
 
 @dataclass(frozen=True, slots=True)
 class Drawing:
-    """A figure as SVG for a page, and for a narrow one where that has another shape."""
+    """A figure as SVG for a page, and for a narrow page if that needs another shape."""
 
     svg: str
     narrow: str | None = None
@@ -95,7 +94,7 @@ def save_drawing(
     narrow: Figure | None = None,
     narrow_in: float | None = None,
 ) -> Drawing:
-    """Write ``NAME.png`` and ``NAME.svg``; returns what a page takes in, as `drawing_of`."""
+    """Write ``NAME.png`` and ``NAME.svg``; return the drawing to embed in a page, as `drawing_of`."""
     figure.savefig(directory / f"{name}.png", dpi=DPI)
     drawing = drawing_of(figure, narrow=narrow, narrow_in=narrow_in)
     (directory / f"{name}.svg").write_text(drawing.svg, encoding="utf-8")
@@ -103,8 +102,10 @@ def save_drawing(
 
 
 def drawing_of(figure: Figure, *, narrow: Figure | None = None, narrow_in: float | None = None) -> Drawing:
-    """A figure without a background. On narrow pages ``narrow`` stands in its place, or the same in another
-    shape, ``narrow_in`` high (absent: as high as it is). A figure that is narrow serves both.
+    """Return a figure as SVG without a background.
+
+    On narrow pages it is replaced by ``narrow``, or by the same figure in another shape, ``narrow_in`` high
+    (by default as high as before). A figure that is narrow already serves both.
     """
     wide = _svg(figure)
     if narrow is None and figure.get_figwidth() <= NARROW_IN:
@@ -123,7 +124,9 @@ def _svg(figure: Figure) -> str:
 
 
 def _themed(svg: str) -> str:
-    svg = re.sub(r' d="[^"]*"', lambda path: re.sub(r"(\.\d\d)\d+", r"\1", path[0]), svg)  # 0.01 pt is enough
+    svg = re.sub(
+        r' d="[^"]*"', lambda path: re.sub(r"(\.\d\d)\d+", r"\1", path[0]), svg
+    )  # round paths to 0.01 pt
     names = {colour: f"--ink{number}" for number, colour in enumerate(DARK)}
     for colour, name in names.items():
         svg = re.sub(rf"(?<=[:\s]){colour}\b", f"var({name})", svg)

@@ -1,9 +1,8 @@
-"""What accuracy costs in time: every solver, preset and kind of voxels, answer by answer of one and the same
-run.
+"""Accuracy against time for solvers, presets and voxel sizes, from the intermediate results of each run.
 
-Whoever looks on sees what the answer would be if the run ended there, with the wall and processor time so
-far, set-up and all, but without the time of looking. Against the truth where it is known (simulated
-recordings), else by the samples it predicts.
+A callback observes the result that a run would have if it ended at that moment, with the wall and processor
+time so far, including set-up but not the time of observation. It is compared with the truth if that is known
+(in simulated recordings), and otherwise judged by its prediction of held-out samples.
 """
 
 from __future__ import annotations
@@ -39,23 +38,23 @@ if TYPE_CHECKING:
     from acquire.store import Recording
 
 APART = 1.15
-"""An answer is looked at when so many times as long has passed as at the last."""
+"""Ratio of the times of two observed results."""
 CUT = ("budget", "stopped")
 DIMMER = 0.5
-"""How much light that is missing counts against light that is there, for the frame that is shown."""
+"""Weight of missing light relative to additional light, in the choice of the frame to show."""
 SSIM_WINDOW, SSIM_FRAMES = 11, 64
-"""Frames that SSIM is the mean of, evenly spaced."""
+"""Window of SSIM in voxels, and number of evenly spaced frames in its mean."""
 COVERED = 0.9
-"""Voxels of an LED's mask that are followed for amplitude and frequency."""
+"""Share of a voxel that an LED must cover to be evaluated for amplitude and frequency."""
 
 
 @dataclass(frozen=True, slots=True)
 class Point:
-    """How good the answer after ``iterations`` was, and what it took. ``None``: unknown, or not its matter.
+    """Accuracy and time of the result after ``iterations``; None for values that are unknown or do not apply.
 
-    ``seconds`` are the wall's, ``processor_s`` those of all threads. ``amplitude_error`` is that of the
-    swings over time, relative; ``frequency_error_hz`` the largest among the scene's sinusoids; ``prediction``
-    the error at samples that the solver did not see, of the last answer. ``frame`` is one frame, to look at.
+    ``seconds`` is wall time, ``processor_s`` the time of all threads. ``amplitude_error`` is the relative
+    error of the changes over time, ``frequency_error_hz`` the largest error among the scene's sinusoids.
+    ``prediction`` is the held-out error of the last result. ``frame`` is one frame to show.
     """
 
     iterations: int
@@ -72,11 +71,10 @@ class Point:
 
 @dataclass(frozen=True, slots=True)
 class Run:
-    """One reconstruction, from its first answer to its last; ``ended`` says what ended it.
+    """One reconstruction, from its first result to its last; ``ended`` is the reason for its end.
 
-    ``case`` names what was reconstructed, with its noise; ``repeat`` counts runs that differ in nothing that
-    was asked for. ``mean_db`` is the PSNR of the truth's own time mean, held: what a still reaches that
-    knows nothing of time.
+    ``case`` names the scene and its noise; ``repeat`` counts runs with the same settings. ``mean_db`` is the
+    PSNR of the truth's mean over time, which is that of the best possible still.
     """
 
     solver: str
@@ -96,13 +94,13 @@ class Run:
 
     @property
     def cut(self) -> bool:
-        """It did not end by itself: what it reached is not what the solver can do."""
+        """Whether the run was cut short, so that it does not show what the solver can reach."""
         return self.ended in CUT
 
 
 @dataclass(slots=True)
 class Judge:
-    """Compares videos of a segment with the truth, where there is one: a scene, or ``light`` (T, n, n)."""
+    """Compares videos of a segment with the truth, if it is known: a scene, or ``light`` (T, n, n)."""
 
     segment: Segment
     scene: Scene | None
@@ -111,7 +109,7 @@ class Judge:
 
     @classmethod
     def of(cls, recording: Recording, segment: Segment, tile: Tile | None = None) -> Judge:
-        """The scene is what a simulated recording says it was; behind a fibre, what is seen in a tile."""
+        """Use the scene that a simulated recording describes; behind a fibre, that of a tile."""
         attrs = recording.attrs
         if not attrs.get("simulated") or "scene" not in attrs:
             return cls(segment, None)
@@ -121,12 +119,12 @@ class Judge:
         return cls(segment, scene)
 
     def frames(self, voxels: Voxels) -> slice:
-        """What is judged: the trusted frames, or all where none is."""
+        """Return the frames to judge: the trusted ones, or all if there are none."""
         trusted = self.segment.geometry.trusted_frames(voxels.temporal_merge)
         return trusted if trusted.stop > trusted.start else slice(None)
 
     def truth(self, voxels: Voxels) -> NDArray[np.float32] | None:
-        """The true voxels of `frames`."""
+        """Return the true voxels of `frames`; None if the truth is not known."""
         if self.scene is None and self.light is None:
             return None
         if voxels not in self._truths:
@@ -140,7 +138,7 @@ class Judge:
         return self._truths[voxels]
 
     def judged(self, point: Point, video: NDArray[Any], voxels: Voxels) -> Point:
-        """``point`` with how good its video is."""
+        """Return ``point`` with the accuracy of its video."""
         shown, true = video[self.frames(voxels)], self.truth(voxels)
         point = replace(point, frame=np.array(shown[self.picked(voxels)], np.float32))
         if true is None:
@@ -155,14 +153,17 @@ class Judge:
         )
 
     def mean_db(self, voxels: Voxels) -> float | None:
-        """PSNR of the truth's time mean, in every frame; None without a truth, and for one that rests."""
+        """Return the PSNR of the truth's mean over time; None if the truth is unknown or constant."""
         true = self.truth(voxels)
         if true is None or np.array_equal(true, true[:1].repeat(len(true), axis=0)):
             return None
         return psnr(np.broadcast_to(true.mean(axis=0), true.shape), true)
 
     def picked(self, voxels: Voxels) -> int:
-        """The frame to show: where the truth is far from its mean, rather brighter; else the middle one."""
+        """Return the frame to show: where the truth differs most from its mean, preferably by more light.
+
+        Without a truth it is the middle frame.
+        """
         true = self.truth(voxels)
         if true is None:
             frames = self.segment.geometry.video_shape(1, voxels.temporal_merge)[0]
@@ -190,7 +191,7 @@ class Judge:
 
 
 def amplitude_error(video: NDArray[Any], truth: NDArray[Any]) -> float | None:
-    """|slope − 1| of the video's changes over time against the truth's; None where nothing changes."""
+    """Return |slope − 1| of the video's changes over time against the truth's; None if nothing changes."""
     true = truth - truth.mean(axis=0)
     swing = float(np.vdot(true, true))
     if swing < 1e-6 * float(np.vdot(truth, truth)):
@@ -208,9 +209,9 @@ def measure(
     *,
     dtype: Dtype = "float32",
 ) -> Run:
-    """Reconstruct once, and look at the answer on the way: at each the time so far, without that of looking.
+    """Reconstruct once and observe intermediate results, with the time so far but without that of observing.
 
-    A run is cut where it takes ``longest_s``.
+    The run is cut after ``longest_s``.
     """
     points: list[Point] = []
 
@@ -219,7 +220,7 @@ def measure(
             return
         begun = time.monotonic(), time.process_time()
         video = now.video()
-        made_s = time.monotonic() - begun[0], time.process_time() - begun[1]  # it is part of an answer
+        made_s = time.monotonic() - begun[0], time.process_time() - begun[1]  # a result needs its video
         at = Point(now.iteration, now.seconds + made_s[0], now.processor_s + made_s[1], now.stage)
         points.append(judge.judged(at, video, voxels))
 
@@ -234,7 +235,7 @@ def measure(
         dtype=dtype,
         refuse=False,
         look=look,
-        check=False,  # what explains the lines better is no part of what a solver takes
+        check=False,  # the search for better explanations of the lines is not part of the solver's time
     )
     prediction = None if np.isnan(result.quality.prediction) else result.quality.prediction
     last = Point(result.iterations, result.seconds, result.processor_s, "end", prediction=prediction)
@@ -252,7 +253,7 @@ def measure(
 
 
 def pareto(runs: Iterable[Run]) -> list[tuple[Run, Point]]:
-    """Points that no other reaches sooner, by time; of runs in the same voxels."""
+    """Return the points whose accuracy no other run reaches sooner, in order of time; for equal voxels."""
     everything = sorted(
         ((run, point) for run in runs for point in run.points if point.psnr_db is not None),
         key=lambda each: each[1].seconds,
@@ -265,7 +266,7 @@ def pareto(runs: Iterable[Run]) -> list[tuple[Run, Point]]:
 
 
 def table(runs: Sequence[Run]) -> list[dict[str, Any]]:
-    """Every answer as a flat row."""
+    """Return every observed result as a flat row."""
     kinds = dict.fromkeys((run.case, run.voxels) for run in runs)
     fronts = {
         id(point)

@@ -1,6 +1,6 @@
-"""Pictures of a trade-off, narrow enough for a telephone.
+"""Plots of a trade-off, narrow enough for a phone.
 
-Axes hold at least what matters, so that a difference of a tenth of a decibel looks like one.
+The axes have a minimum range, so that a difference of a tenth of a decibel looks small.
 """
 
 from __future__ import annotations
@@ -33,17 +33,17 @@ LINES = {"fast": ":", "balanced": "-", "best": "--"}
 MARKERS = {"fast": "o", "balanced": "s", "best": "D"}
 FRAMES = 5
 LEAST_OCTAVES, MANY_OCTAVES = 2.0, 3.5
-"""Of time: what an axis shows at least, and beyond which it has fewer ticks."""
+"""Minimum range of a time axis, and range above which it has fewer ticks."""
 
 
 @dataclass(frozen=True, slots=True)
 class Metric:
-    """A quantity of a `Point`: its label, what an axis shows at least, a floor where it is logarithmic."""
+    """A quantity of a `Point`: its label, the minimum range of its axis, and a floor if it is logarithmic."""
 
     name: str
     label: str
     least: tuple[float, float]
-    """Lowest and highest, or for decibels the span that is shown."""
+    """Lowest and highest value; for decibels, the second is the minimum range."""
     floor: float | None = None
     scale: float = 1.0
 
@@ -62,13 +62,13 @@ def known(runs: Sequence[Run], metric: Metric) -> bool:
 
 
 def yardstick(runs: Sequence[Run]) -> float | None:
-    """The median PSNR of the truth's own time mean, where it is known and is no truth itself."""
+    """Return the median PSNR of the truth's mean over time; None if unknown, or if the scene is constant."""
     known_db = [run.mean_db for run in runs if run.mean_db is not None]
     return float(np.median(known_db)) if known_db else None
 
 
 def in_series(runs: Sequence[Run]) -> dict[Series, list[Run]]:
-    """Repeats together."""
+    """Group runs by solver, preset and dtype, so that repeats are together."""
     found: dict[Series, list[Run]] = {}
     for run in runs:
         found.setdefault((run.solver, run.preset, run.dtype), []).append(run)
@@ -76,7 +76,7 @@ def in_series(runs: Sequence[Run]) -> dict[Series, list[Run]]:
 
 
 def curves(runs: Sequence[Run], metric: Metric, clock: Clock) -> Figure:
-    """A quantity over time: the median of the repeats, their band, and where each run ended."""
+    """Plot a quantity over time: the median of the repeats, their band, and the end of each run."""
     with mpl.rc_context(STYLE):
         figure = canvas(HEIGHT_IN, WIDTH_IN)
         ax = figure.subplots()
@@ -149,7 +149,7 @@ def _value_axis(ax: Axes, metric: Metric) -> None:
 
 
 def frames(run: Run, truth: NDArray[Any] | None) -> Figure:
-    """One frame as it was after more and more time of one run, and as it is in truth."""
+    """Draw one frame after more and more time of one run, and the same frame of the truth."""
     points = _spread(run.points)
     peak = white(run, truth)
     with mpl.rc_context(STYLE):
@@ -170,14 +170,14 @@ def frames(run: Run, truth: NDArray[Any] | None) -> Figure:
 
 
 def white(run: Run, truth: NDArray[Any] | None) -> float:
-    """The value that pictures of a run show white."""
+    """Return the value that the pictures of a run show as white."""
     shown = run.end.frame if truth is None else truth
     assert shown is not None
     return float(np.quantile(shown, 0.999)) or 1.0
 
 
 def _spread(points: Sequence[Point]) -> list[Point]:
-    """At most five, evenly over the logarithm of the time, the first and the last among them."""
+    """Choose up to five points, evenly spaced in the logarithm of time, including the first and the last."""
     wanted = np.geomspace(points[0].seconds, points[-1].seconds, FRAMES)
     times = np.array([each.seconds for each in points])
     places = {int(np.argmin(np.abs(np.log(times / at)))) for at in wanted}
@@ -185,6 +185,6 @@ def _spread(points: Sequence[Point]) -> list[Point]:
 
 
 def in_caption(point: Point) -> str:
-    """What an answer took, and how good it was."""
+    """Return the time and the accuracy of a result, for a caption."""
     quality = "" if point.psnr_db is None else f": {point.psnr_db:.0f} dB"
     return f"{plain(point.seconds)} s{quality}"

@@ -1,4 +1,4 @@
-"""The trade-off on one page: what time buys, in words, curves and frames, and the table."""
+"""The trade-off on one page: accuracy against time as sentences, curves and frames, and a table."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ if TYPE_CHECKING:
     Truths = Mapping[tuple[str, Voxels], NDArray[Any] | None]
 
 SHOWN_MS = 400
-"""Each answer, in the player."""
+"""Time for which the player shows each result."""
 QUANTITIES = ("seconds", "processor_s", "psnr_db", "ssim", "amplitude_error", "frequency_error_hz")
 
 
@@ -55,10 +55,10 @@ def write_page(
     heading: dict[str, Any],
     when: datetime,
 ) -> Path:
-    """Write ``index.html``, ``tradeoff.csv``, ``tradeoff.json`` and the pictures into ``directory``.
+    """Write ``index.html``, ``tradeoff.csv``, ``tradeoff.json`` and the plots into ``directory``.
 
-    ``truths`` are the true frames beside those that runs show; ``heading`` has ``title``, ``command``,
-    ``notes``, sentences about all of it, and ``host``, how busy the machine was.
+    ``truths`` are the true frames that correspond to the frames shown; ``heading`` has ``title``,
+    ``command``, ``notes`` (sentences about the whole page) and ``host`` (the load of the machine).
     """
     rows = table(runs)
     facts: dict[str, Any] = {
@@ -85,7 +85,7 @@ def write_page(
                 "shown": f"{shown.solver}, {shown.preset}",
                 "sentences": [
                     *(text for repeats in in_series(own).values() for text in sentences(repeats)),
-                    *_beside_a_still(own),
+                    *_still_sentence(own),
                 ],
                 "ends": [_end(repeats) for repeats in in_series(own).values()],
                 "pictures": [{"name": name, "what": what} for name, (what, _) in drawn.items()],
@@ -109,22 +109,22 @@ def write_page(
 def _draw(
     runs: Sequence[Run], shown: Run, truth: NDArray[Any] | None, prefix: str
 ) -> dict[str, tuple[str, Figure]]:
-    """One case in one kind of voxels: name → what it shows, and its figure."""
-    asked: list[tuple[Metric, str, str, Clock]] = [
+    """Draw the figures of one case and voxel size: name → description and figure."""
+    plots: list[tuple[Metric, str, str, Clock]] = [
         (metric, metric.name, "wall time", "seconds") for metric in METRICS if known(runs, metric)
     ]
-    if asked:
-        asked.insert(1, (asked[0][0], "processor", "processor time", "processor_s"))
+    if plots:
+        plots.insert(1, (plots[0][0], "processor", "processor time", "processor_s"))
     drawn = {
         f"{prefix}-{name}": (f"{metric.label} over {time}", curves(runs, metric, clock))
-        for metric, name, time, clock in asked
+        for metric, name, time, clock in plots
     }
-    what = f"one frame on the way: {shown.solver}, {shown.preset}"
+    what = f"one frame after more and more time: {shown.solver}, {shown.preset}"
     return drawn | {f"{prefix}-frames": (what, frames(shown, truth))}
 
 
 def _movie(run: Run, truth: NDArray[Any] | None) -> dict[str, Any]:
-    """Every answer of a run, beside the truth where it is known, for the page's player."""
+    """Draw every result of a run, next to the truth if it is known, for the page's player."""
     peak = white(run, truth)
     pictures = [
         beside([each.frame] if truth is None else [each.frame, truth], peak)
@@ -136,20 +136,20 @@ def _movie(run: Run, truth: NDArray[Any] | None) -> dict[str, Any]:
     return {"frames": clip.frames, "labels": labels[:: clip.step], "beside": truth is not None}
 
 
-def _beside_a_still(runs: Sequence[Run]) -> list[str]:
-    """How the runs stand to the best still that there could be."""
+def _still_sentence(runs: Sequence[Run]) -> list[str]:
+    """Compare the runs with the best possible still."""
     mean_db = yardstick(runs)
     if mean_db is None:
         return []
     reached = max(run.end.psnr_db or 0.0 for run in runs)
     than = (
-        "more than any of these reached" if mean_db > reached else f"the best of these reached {reached:.0f}"
+        "more than any of these runs" if mean_db > reached else f"the best of these runs has {reached:.0f} dB"
     )
-    return [f"The truth's own time mean, shown as a still, has {mean_db:.0f} dB: {than}."]
+    return [f"The truth's mean over time, shown as a still, has {mean_db:.0f} dB; {than}."]
 
 
 def _end(repeats: Sequence[Run]) -> dict[str, Any]:
-    """Where the repeats of a series ended: the median of each quantity, and lowest and highest."""
+    """Summarise where the repeats of a series ended: median, lowest and highest value of each quantity."""
     first = repeats[0]
     found: dict[str, Any] = {
         "solver": first.solver,
@@ -166,7 +166,7 @@ def _end(repeats: Sequence[Run]) -> dict[str, Any]:
 
 
 def _effects(study: Study) -> Figure:
-    """What each effect of the simulator changes in the lines, against what it costs."""
+    """Plot the change of the lines without each effect of the simulator against the effect's cost."""
     figure = canvas(3.4)
     ax = figure.subplots()
     known = [worth for worth in study.effects if worth.noises is not None]
@@ -181,7 +181,7 @@ def _effects(study: Study) -> Figure:
         xscale="log",
         yscale="log",
         xlabel="cost (µs per line and arm)",
-        ylabel="error of the lines without it\n(in their noise)",
+        ylabel="error of the lines without it\n(relative to their noise)",
         xlim=(min(costs) / 1.6, max(costs) * 3),
     )
     return figure

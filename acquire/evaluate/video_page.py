@@ -1,4 +1,4 @@
-"""Reconstructed videos on one page: a player, what they leave unexplained, each sub-segment's account."""
+"""Reconstructed videos on one page: a player, the residual over time, and the facts of each sub-segment."""
 
 from __future__ import annotations
 
@@ -23,10 +23,10 @@ if TYPE_CHECKING:
     from acquire.store import VideoFile
 
 MOST_PARTS, MOST_POINTS = 100, 1500
-"""Sub-segments and points of a curve that a page shows; a video may have any number."""
+"""Largest number of sub-segments and of points of a curve on a page; a video may have any number."""
 KNOWN = ("recording", "first_line", "lines", "solver", "preset", "seconds")
 LEAST_PERCENT, MOST_PERCENT = 5.0, 100.0
-"""Between which the axis of what is unexplained ends: noise is not magnified, nor are lines in the dark."""
+"""Limits for the top of the residual axis, so that neither noise nor lines in the dark dominate the plot."""
 NARROW_IN = 2.2
 
 
@@ -38,9 +38,9 @@ def write_page(
     look: Look,
     progress: Callable[[int, int], object] | None = None,
 ) -> int:
-    """Write ``path``: the videos side by side at ``times`` (UTC, ns); how many frames its player holds.
+    """Write a page with the videos side by side at ``times`` (UTC, ns); return the frames in its player.
 
-    Pixels are shown as they are, at most ``look.panel_px`` of them from top to bottom.
+    Pixels are shown in their original size, at most ``look.panel_px`` from top to bottom.
     """
     height = min(look.panel_px, max(panel.file.video.shape[1] for panel in panels))
     pictures = []
@@ -69,22 +69,22 @@ def write_page(
 
 
 def _label(panels: Sequence[Panel], time_ns: int, start_ns: int) -> str:
-    """When the frames are, and which of them are not to be trusted."""
-    doubted = [
+    """Return the time of the frames, and the videos whose frame is not trusted."""
+    untrusted = [
         panel.name
         for panel in panels
         if panel.file.trusted is not None and panel.index(time_ns) not in panel.file.trusted
     ]
     at = f"{(time_ns - start_ns) / 1e6:.3f} ms"
-    return f"{at} · not trusted: {', '.join(doubted)}" if doubted else at
+    return f"{at} · not trusted: {', '.join(untrusted)}" if untrusted else at
 
 
 def _account(panel: Panel) -> dict[str, Any]:
-    """What is known of one video: of its frames from itself, of the rest from its provenance."""
+    """Return the facts of one video, from its arrays and its provenance."""
     file, known = panel.file, panel.file.attrs.get("provenance") or {}
     count, rows, columns = file.video.shape
     parts = known.get("segments", [])
-    of_parts = [text for part in parts for text in part["warnings"]]  # all that older videos have
+    of_parts = [text for part in parts for text in part["warnings"]]  # older videos have only these
     return {
         "name": panel.name,
         "size": f"{count} frames of {rows} × {columns}, {file.interval_ns / 1e3:.6g} µs each",
@@ -118,12 +118,12 @@ def _percent(share: float | None) -> float | None:
 
 
 def _misfit(file: VideoFile) -> Drawing | None:
-    """What of its lines each frame leaves unexplained; grey where it is not trusted."""
+    """Plot the relative residual of the lines of each frame; grey where frames are not trusted."""
     if file.quality is None or not np.isfinite(file.quality).any():
         return None
     width = -(-len(file.quality) // MOST_POINTS)
     padded = np.pad(file.quality.astype(np.float64), (0, -len(file.quality) % width), constant_values=np.nan)
-    worst = np.fmax.reduce(padded.reshape(-1, width), axis=1)  # of frames that share a point
+    worst = np.fmax.reduce(padded.reshape(-1, width), axis=1)  # the worst of the frames that share a point
     times_ms = (file.time_ns[::width] - file.time_ns[0]) / 1e6
     end_ms = times_ms[-1] + width * file.interval_ns / 1e6
     with mpl.rc_context(STYLE):
@@ -135,5 +135,5 @@ def _misfit(file: VideoFile) -> Drawing | None:
                 ax.axvspan(low, high, color=GRID, lw=0)
         top = np.clip(1.1 * 100 * np.nanmax(worst), LEAST_PERCENT, MOST_PERCENT)
         ax.step(times_ms, 100 * worst, where="post", color=SOLVER_COLOURS[0], lw=1.1)
-        ax.set(xlim=(0, end_ms), ylim=(0, top), xlabel="time (ms)", ylabel="unexplained (%)")
+        ax.set(xlim=(0, end_ms), ylim=(0, top), xlabel="time (ms)", ylabel="residual (%)")
         return drawing_of(figure, narrow_in=NARROW_IN)

@@ -1,13 +1,13 @@
-"""Recordings and videos in the files of other programs, and lines of other programs as recordings.
+"""Export of recordings and videos to the files of other programs, and import of other programs' lines.
 
 ::
 
     from_video, from_recording ─▶ content (in blocks) ─▶ tiff | hdf5 | arrays | movie ─▶ one file
     line files ─▶ foreign (blocks of lines) ─▶ importing, code_words ─▶ a sealed recording
-    napari_reader, lazy · xarray_engine   found by their programs through entry points
+    napari_reader, lazy · xarray_engine   found by napari and xarray through entry points
 
-Nothing is read before it is written: memory stays bounded, however long a recording is. Libraries that only
-these files need are imported when one is asked for; the extra ``[export]`` brings them.
+Data are read block by block as they are written, so memory stays bounded however long a recording is. The
+libraries for these files are imported on demand; the extra ``[export]`` installs them.
 """
 
 from acquire.exchange.code_words import parse_code

@@ -1,5 +1,4 @@
-"""NumPy's own files: ``.npy`` is the image alone, ``.npz`` has its columns, what lies beside it, and the
-facts (JSON), too."""
+"""NumPy files: ``.npy`` holds only the image, ``.npz`` all arrays and the facts (JSON)."""
 
 from __future__ import annotations
 
@@ -18,13 +17,13 @@ if TYPE_CHECKING:
 
 
 def write_npy(path: Path, content: Content, advance: Callable[[int], object]) -> None:
-    """The image. Raises OSError as the disk gives it."""
+    """Write the image. Raises OSError from the disk."""
     with path.open("wb") as file:
         _write(file, content.image, advance)
 
 
 def write_npz(path: Path, content: Content, advance: Callable[[int], object]) -> None:
-    """All arrays by name, and ``facts``: JSON in a text. Raises OSError as the disk gives it."""
+    """Write all arrays by name, and ``facts`` as JSON in a text. Raises OSError from the disk."""
     with zipfile.ZipFile(path, "w", zipfile.ZIP_STORED, allowZip64=True) as archive:
         for array in (content.image, *content.columns, *content.beside):
             with archive.open(f"{array.name}.npy", "w", force_zip64=True) as file:

@@ -1,4 +1,4 @@
-"""Codes as a user writes them: a register and its state, bits in a file or in hexadecimal, or a constant."""
+"""Exposure codes on the command line: a register and its state, bits in a file or in hex, a constant."""
 
 from __future__ import annotations
 
@@ -21,13 +21,14 @@ if TYPE_CHECKING:
     from acquire.codes import Code
 
 POSSIBLE = (
-    "prbs:DEGREE:SEED with a seed as in a rig file, or the register's state as 0x…; bits:0x… (the first bit "
-    "is the highest of the first digit); bits:FILE, a text of 0 and 1, or of 0x…, or .npy; constant:1"
+    "prbs:DEGREE:SEED with a seed as in a rig file, or with the register's state as 0x…; bits:0x… (the first "
+    "bit is the highest one of the first digit); bits:FILE, a text of 0 and 1 or of 0x…, or a .npy file; "
+    "constant:1"
 )
 
 
 def parse_code(text: str, *, repeats: bool = False) -> Code:
-    """The code in words. ``repeats``: listed bits begin anew after the last. UsageError names what can be."""
+    """Parse a code; with ``repeats``, listed bits repeat. Raises UsageError that names the forms."""
     kind, _, rest = text.partition(":")
     if kind == "prbs" and (found := re.fullmatch(r"(\d{1,2}):(0x[0-9a-fA-F]+|\d+)", rest)):
         degree, number = int(found[1]), found[2]
@@ -38,27 +39,22 @@ def parse_code(text: str, *, repeats: bool = False) -> Code:
         return ConstantCode(int(rest))
     if kind == "bits" and rest:
         return ListedCode.of(_bits(rest), repeats=repeats)
-    raise UsageError(f"code {shortened(text)!r} cannot be read", possible=POSSIBLE)
+    raise UsageError(f"the code {shortened(text)!r} cannot be read", possible=POSSIBLE)
 
 
 def _bits(text: str) -> NDArray[np.uint8]:
-    if re.fullmatch("0x[0-9a-fA-F]+", text):
-        return _from_hex(text)
-    path = Path(text)
-    if path.suffix == ".npy":
-        return _from_array(path)
-    with refused(path, "read"):
-        raw = read_regular(path, MOST_LISTED_BITS * 2)
-    written = "".join(raw.decode("ascii", "replace").split())
-    if re.fullmatch("0x[0-9a-fA-F]+", written):
-        return _from_hex(written)
-    if not re.fullmatch("[01]+", written):
-        raise UsageError(f"{path} holds no bits", possible="0 and 1, with or without spaces, or 0x…")
-    return np.frombuffer(written.encode(), np.uint8) - ord("0")
-
-
-def _from_hex(text: str) -> NDArray[np.uint8]:
-    """Four bits for each digit."""
+    """Return the bits of hex digits, or of a file."""
+    if not re.fullmatch("0x[0-9a-fA-F]+", text):
+        path = Path(text)
+        if path.suffix == ".npy":
+            return _from_array(path)
+        with refused(path, "read"):
+            raw = read_regular(path, MOST_LISTED_BITS * 2)
+        text = "".join(raw.decode("ascii", "replace").split())
+        if re.fullmatch("[01]+", text):
+            return np.frombuffer(text.encode(), np.uint8) - ord("0")
+        if not re.fullmatch("0x[0-9a-fA-F]+", text):
+            raise UsageError(f"{path} does not hold bits", possible="0 and 1, with or without spaces, or 0x…")
     digits = text[2:]
     padded = digits + "0" * (len(digits) % 2)
     return np.unpackbits(np.frombuffer(bytes.fromhex(padded), np.uint8))[: 4 * len(digits)]
@@ -71,11 +67,11 @@ def _from_array(path: Path) -> NDArray[np.uint8]:
             found = mapped(path)
         except ValueError as error:
             raise UsageError(f"{path} cannot be read as NumPy: {error}") from error
-    # Records cannot be compared with numbers, and of complex numbers the half would be dropped.
+    # Records cannot be compared with numbers, and complex numbers would lose their imaginary part.
     is_real = found.dtype.kind in "biuf" and found.ndim == 1
     if not (is_real and 0 < len(found) <= MOST_LISTED_BITS and np.isin(found, (0, 1)).all()):
         raise UsageError(
-            f"{path} holds no bits: {found.dtype} {found.shape}",
+            f"{path} does not hold bits: it is an array of {found.dtype} {found.shape}",
             possible=f"one axis of up to {MOST_LISTED_BITS} values, 0 or 1",
         )
     return np.asarray(found, np.uint8)

@@ -1,4 +1,4 @@
-"""What an export writes: one image of three axes, columns beside it, and facts; all read in blocks."""
+"""The content of an export: one image with three axes, columns along them, and facts; read in blocks."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 Block = tuple[tuple[Any, ...], "NDArray[Any]"]
-"""Where a piece of an array belongs (an index), and the piece; pieces follow one another in C order."""
+"""A piece of an array with its index; the pieces follow one another in C order."""
 
 
 @dataclass(frozen=True, slots=True)
 class Axis:
-    """One axis of an image: coordinate ``first + i * step`` in ``unit``; ``step`` None: numbers of things."""
+    """One axis of an image: coordinate ``first + i * step`` in ``unit``; ``step`` None for indices."""
 
     name: str
     step: float | None = None
@@ -44,11 +44,11 @@ class Array:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Content:
-    """What is exported, a ``kind`` of ``video`` or ``lines``.
+    """The content of an export; ``kind`` is ``video`` or ``lines``.
 
-    ``columns`` lie along axes of the image; ``beside`` have its first axis and others of their own.
-    ``facts`` is JSON: where it comes from, and what of it can be trusted. ``untrusted`` counts the frames
-    among those that are written which are not sampled in full.
+    ``columns`` lie along axes of the image; arrays in ``beside`` share its first axis and have others of
+    their own. ``facts`` is JSON: the origin of the data and the trusted part. ``untrusted`` counts the
+    written frames that are not trusted.
     """
 
     kind: str
@@ -62,10 +62,10 @@ class Content:
 
 
 def little(dtype: np.dtype[Any]) -> np.dtype[Any]:
-    """The same, with the byte order of the files that are written."""
+    """Return a type in little-endian byte order, that of the written files."""
     return np.dtype(dtype).newbyteorder("<")
 
 
 def block(index: tuple[Any, ...], values: NDArray[Any]) -> Block:
-    """A piece of an array as it is written."""
+    """Return a piece of an array in the byte order of the written files."""
     return index, values.astype(little(values.dtype), copy=False)

@@ -1,4 +1,4 @@
-"""Writes what is exported as the one file that its name asks for: whole, or not at all."""
+"""Writes an export as one file in the format of its suffix, completely or not at all."""
 
 from __future__ import annotations
 
@@ -32,23 +32,23 @@ SUFFIXES = {
     ".npz": "npz",
     ".mp4": "movie",
 }
-"""What a file's name ends with → how it is written; the longest ending counts."""
+"""Suffix → format; the longest suffix that matches counts."""
 
 
 def format_for(path: Path) -> str:
-    """One of the values of `SUFFIXES`. UsageError for a name that says none."""
+    """Return the format of a file name, a value of `SUFFIXES`. Raises UsageError if it has none."""
     for suffix, name in SUFFIXES.items():
         if path.name.lower().endswith(suffix):
             return name
     raise UsageError(
-        f"{path}: its name does not say what it is to be",
+        f"the format of {path} cannot be taken from its name",
         possible=".tif (ImageJ), .ome.tif, .h5 or .nxs (NeXus), .npy, .npz, .mp4",
         hint=f"{path.with_suffix('.h5')}",
     )
 
 
 def check_export(content: Content, path: Path) -> None:
-    """UsageError for what cannot be written so, before anything is touched."""
+    """Raise UsageError if the content cannot be written in this format, before anything is written."""
     kind = format_for(path)
     check_new_path(path)
     if kind in {"imagej", "ome"}:
@@ -60,7 +60,7 @@ def check_export(content: Content, path: Path) -> None:
 
 
 def left_out(content: Content, path: Path) -> tuple[str, ...]:
-    """Names of what lies beside the image that such a file does not hold."""
+    """Return the names of the accompanying arrays that a file of this format cannot hold."""
     return (
         tuple(each.name for each in content.beside) if format_for(path) in {"imagej", "npy", "movie"} else ()
     )
@@ -74,11 +74,11 @@ def export(
     fps: float = 25.0,
     peak: float | None = None,
 ) -> int:
-    """Write ``content`` as ``path``'s name says; the size of the file in bytes.
+    """Write ``content`` in the format of ``path``'s name; return the size of the file in bytes.
 
-    ``fps`` and ``peak`` (white) are of movies. ``progress`` takes (bytes done, of how many). Raises
-    UsageError as `check_export`, DataError for what cannot be read, and StoreError where the disk refuses;
-    then nothing is left.
+    ``fps`` and ``peak`` (white) apply to movies. ``progress`` takes (bytes done, total). Raises UsageError as
+    `check_export`, DataError for data that cannot be read, and StoreError for errors of the disk; no file is
+    left then.
     """
     check_export(content, path)
     kind, done = format_for(path), 0

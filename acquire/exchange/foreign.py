@@ -1,10 +1,10 @@
-"""Files of lines that other programs wrote, read in blocks: NumPy, HDF5, TIFF, and bare numbers.
+"""Files of lines from other programs, read in blocks: NumPy, HDF5, TIFF and raw binary.
 
 ::
 
     FILE ─▶ LineFile: (line, pixel), or (arm, line, pixel)    .rows(arm, start, stop) ─▶ (line, pixel)
 
-Everything that can be wrong with a file's shape or type is found when it is opened; nothing is read before.
+Any problem with a file's shape or type is found when it is opened; lines are read later.
 """
 
 from __future__ import annotations
@@ -42,26 +42,25 @@ KINDS = {
     ".bin": "raw",
     ".dat": "raw",
 }
-"""What a file's name ends with → what it is."""
+"""Suffix → kind of file."""
 TYPES = ("uint8", "uint16")
 MOST_PAGE_BYTES = 2**28
-"""Of one page of a TIFF file that is not in one piece: it is unpacked whole, one of each arm at a time."""
+"""Largest page of a compressed or scattered TIFF file; one page per arm is decompressed at a time."""
 MALFORMED = (*DAMAGE, zlib.error, lzma.LZMAError)
-"""What libraries raise for damaged files: tifffile passes on the errors of its decompressors."""
+"""Exceptions that libraries raise for damaged files; tifffile passes on those of its decompressors."""
 ARCHIVE = b"PK\x03\x04"
-"""What an ``.npz`` file begins with."""
+"""First bytes of an ``.npz`` file."""
 
 
 @dataclass(frozen=True, slots=True)
 class Layout:
-    """What a file does not say itself.
+    """The layout of a file, as far as the file itself does not define it.
 
-    Attributes
-    ----------
-    dtype, pixels, skip_bytes : of bare numbers: type (``uint8``, ``<u2``, ``>u2``), pixels of a line, and
-        what comes before the first
-    dataset : path of the array inside an HDF5 file; None: the only one that can be lines
-    columns : pixels of a line that are the arm's, first and after the last; None: all
+    Attributes ---------- dtype, pixels, skip_bytes : for raw binary: sample type (``uint8``, ``<u2``,
+    ``>u2``), pixels per line, and
+        bytes before the first line
+    dataset : path of the array inside an HDF5 file; None for the only one that can be lines
+    columns : pixels of each line that belong to the arm, first and after the last; None for all
     """
 
     dtype: str | None = None
@@ -73,7 +72,10 @@ class Layout:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LineFile:
-    """``shape`` is (line, pixel) or (arm, line, pixel); ``read`` takes arm (None), start and stop."""
+    """An open file of lines. ``shape`` is (line, pixel) or (arm, line, pixel).
+
+    ``read`` takes the arm (None for the first form), start and stop.
+    """
 
     path: Path
     kind: str
@@ -84,7 +86,7 @@ class LineFile:
 
     @property
     def arms(self) -> int:
-        """1, or 2 where the file has both."""
+        """Number of arms in the file, 1 or 2."""
         return self.shape[0] if len(self.shape) == 3 else 1
 
     @property
@@ -96,7 +98,7 @@ class LineFile:
         return self.shape[-1]
 
     def rows(self, arm: int | None, start: int, stop: int) -> NDArray[Any]:
-        """Lines ``start`` to ``stop - 1`` (line, pixel), in the machine's byte order. Raises DataError."""
+        """Read lines ``start`` to ``stop - 1`` (line, pixel) in native byte order. Raises DataError."""
         try:
             found = np.asarray(self.read(arm, start, stop))
         except MALFORMED as error:
@@ -108,7 +110,7 @@ class LineFile:
 
 @contextmanager
 def open_lines(path: Path, layout: Layout) -> Iterator[LineFile]:
-    """A file of lines. UsageError for what cannot be read as lines, PlaceError where there is no file."""
+    """Open a file of lines. Raises UsageError if it does not hold lines, PlaceError if there is no file."""
     kind = _kind(path, layout)
     openers = {"NumPy": _numpy, "HDF5": _hdf5, "TIFF": _tiff, "raw": _raw}
     with ExitStack() as held:
@@ -121,27 +123,27 @@ def open_lines(path: Path, layout: Layout) -> Iterator[LineFile]:
         if len(file.shape) not in {2, 3} or 0 in file.shape or file.arms not in {1, 2}:
             raise UsageError(
                 f"{file.path} has the shape {shape}",
-                possible="(line, pixel), or (arm, line, pixel) of two arms",
+                possible="(line, pixel), or (arm, line, pixel) with two arms",
             )
         if file.dtype.newbyteorder("=").name not in TYPES:
             raise UsageError(
                 f"{file.path} holds {file.dtype.name}",
                 possible=", ".join(TYPES),
-                hint="raw values of the camera",
+                hint="the camera's raw values",
             )
         yield file if layout.columns is None else _cropped(file, layout.columns)
 
 
 def check_file(path: Path) -> None:
-    """PlaceError unless there is a regular file: a pipe would keep a reader waiting."""
+    """Raise PlaceError unless there is a regular file; a pipe would block a reader."""
     with refused(path, "read"):
         if (kind := kind_of(path.stat().st_mode)) is not None:
             raise PlaceError(f"{path} cannot be read: it is {kind}", possible="a file")
 
 
 def mapped(path: Path) -> np.memmap[Any, np.dtype[Any]]:
-    """The array of a ``.npy`` file, read when sliced. UsageError for an archive, ValueError for junk."""
-    # np.load would open the archive, and leave the file open where that fails: one that was cut short.
+    """Map the array of a ``.npy`` file. Raises UsageError for an archive, ValueError for other contents."""
+    # np.load would open an archive, and leave the file open if that fails (for a truncated one).
     with path.open("rb") as file:
         if file.read(len(ARCHIVE)) == ARCHIVE:
             raise UsageError(f"{path} is an archive of several arrays", possible="one array in a .npy file")
@@ -153,12 +155,14 @@ def _kind(path: Path, layout: Layout) -> str:
         return "raw"
     kind = KINDS.get(path.suffix.lower())
     if kind == "raw":
-        raise UsageError(f"{path}: bare numbers do not say what they are", hint="--dtype and --pixels")
+        raise UsageError(
+            f"{path} is raw binary, which does not define its layout", hint="--dtype and --pixels"
+        )
     if kind is None:
         raise UsageError(
-            f"{path}: its name does not say what it is",
+            f"the format of {path} cannot be taken from its name",
             possible=", ".join(KINDS),
-            hint="--dtype and --pixels for bare numbers",
+            hint="--dtype and --pixels for raw binary",
         )
     return kind
 
@@ -185,7 +189,7 @@ def _cropped(file: LineFile, columns: tuple[int, int]) -> LineFile:
 
 
 def _sliced(array: Any) -> Callable[[int | None, int, int], NDArray[Any]]:
-    """Lines of an array that reads when it is sliced."""
+    """Return a reader for the lines of an array that is read when it is sliced."""
 
     def read(arm: int | None, start: int, stop: int) -> NDArray[Any]:
         found: NDArray[Any] = array[start:stop] if array.ndim == 2 else array[arm or 0, start:stop]
@@ -197,7 +201,7 @@ def _sliced(array: Any) -> Callable[[int | None, int, int], NDArray[Any]]:
 def _plain(
     path: Path, dtype: np.dtype[Any], shape: tuple[int, ...], offset: int
 ) -> Callable[[int | None, int, int], NDArray[Any]]:
-    """Lines that lie one after the other. They are read, not mapped: a file that shrinks is an error then."""
+    """Return a reader for contiguous lines, which are not mapped, so that a shrinking file is an error."""
     line_bytes = shape[-1] * dtype.itemsize
 
     def read(arm: int | None, start: int, stop: int) -> NDArray[Any]:
@@ -220,7 +224,7 @@ def _hdf5(path: Path, layout: Layout, held: ExitStack) -> LineFile:
     file = held.enter_context(h5py.File(path, "r"))
     there = _datasets(file, h5py)
     if layout.dataset is None:
-        # An export of ours has its flags beside the lines, and they are uint16 of two axes, too.
+        # In our own exports the flags, which are also uint16 with two axes, are next to the lines.
         found = [name for name in there if not name.endswith("/flags")]
         if len(found) != 1:
             raise UsageError(
@@ -243,7 +247,7 @@ def _hdf5(path: Path, layout: Layout, held: ExitStack) -> LineFile:
 
 
 def _datasets(file: Any, h5py: Any) -> list[str]:
-    """Paths of the arrays that can be lines."""
+    """Return the paths of the arrays that can be lines."""
     found: list[str] = []
 
     def visit(name: str, node: Any) -> None:
@@ -257,17 +261,18 @@ def _datasets(file: Any, h5py: Any) -> list[str]:
 def _raw(path: Path, layout: Layout, _: ExitStack) -> LineFile:
     if layout.dtype is None or layout.pixels is None:
         raise UsageError(
-            f"{path}: of bare numbers, type and pixels of a line are needed", hint="--dtype and --pixels"
+            f"{path} is raw binary, which needs a sample type and the pixels per line",
+            hint="--dtype and --pixels",
         )
     dtype, pixels = np.dtype(layout.dtype), layout.pixels
     size, line_bytes = path.stat().st_size - layout.skip_bytes, dtype.itemsize * pixels
     if pixels < 1 or layout.skip_bytes < 0 or size < line_bytes:
-        raise UsageError(f"{path} has {size} bytes of pixels", possible=f"{line_bytes} for every line")
+        raise UsageError(f"{path} has {size} bytes of pixels", possible=f"{line_bytes} bytes for every line")
     if size % line_bytes:
         raise UsageError(
-            f"{path}: {size} bytes are no whole number of lines of {pixels} pixels {dtype.name}",
-            possible=f"{size // line_bytes} lines, and {size % line_bytes} bytes are left",
-            hint="--skip-bytes for what comes before the first line, or another --pixels or --dtype",
+            f"{path}: {size} bytes are not a whole number of lines of {pixels} pixels {dtype.name}",
+            possible=f"{size // line_bytes} lines, with {size % line_bytes} bytes left over",
+            hint="--skip-bytes for the bytes before the first line, or another --pixels or --dtype",
         )
     shape = (size // line_bytes, pixels)
     facts = {"dtype": dtype.str, "skip_bytes": layout.skip_bytes}
@@ -282,7 +287,7 @@ def _raw(path: Path, layout: Layout, _: ExitStack) -> LineFile:
 
 
 def _tiff(path: Path, _: Layout, held: ExitStack) -> LineFile:
-    """Pages are stretches of lines, one after the other; two channels are the arms."""
+    """Open a TIFF file: its pages are consecutive ranges of lines, and two channels are the arms."""
     tifffile = library("tifffile", "export", "a TIFF file")
     file = held.enter_context(tifffile.TiffFile(path))
     series = file.series[0]
@@ -295,20 +300,21 @@ def _tiff(path: Path, _: Layout, held: ExitStack) -> LineFile:
 
 
 def _pages(path: Path, series: Any, lines: tuple[int, ...]) -> Callable[[int | None, int, int], NDArray[Any]]:
-    """Lines out of pages that are packed, or scattered over the file."""
+    """Return a reader for lines in pages that are compressed, or scattered over the file."""
     rows, pixels = (int(size) for size in series.pages[0].shape)
     if rows * pixels * series.dtype.itemsize > MOST_PAGE_BYTES:
         raise UsageError(
-            f"{path} is packed in pages of {rows} x {pixels} pixels",
+            f"{path} has compressed pages of {rows} x {pixels} pixels, which are too large",
             possible=f"up to {MOST_PAGE_BYTES} bytes in a page",
             hint="the file without compression",
         )
-    # An import reads blocks of the arms in turn: with one page for both, each block would unpack one anew.
+    # An import reads blocks of the arms in turn, so one page is kept for each arm: with a single one, every
+    # block would be decompressed again.
     last: dict[int, tuple[int, NDArray[Any]]] = {}
 
     def page(arm: int, number: int) -> NDArray[Any]:
         if arm not in last or last[arm][0] != number:
-            last.pop(arm, None)  # before the next is unpacked: never two of one arm in memory
+            last.pop(arm, None)  # before the next is decompressed, to never hold two pages of an arm
             last[arm] = number, series.pages[number].asarray().reshape(rows, pixels)
         return last[arm][1]
 

@@ -1,4 +1,4 @@
-"""Lines of a recording, with their tags and flags, as the content of an export."""
+"""The lines of a recording, with their tags and flags, as the content of an export."""
 
 from __future__ import annotations
 
@@ -21,97 +21,87 @@ if TYPE_CHECKING:
     from acquire.store import Recording
 
 BLOCK_BYTES = 2**23
-"""Of pixels that are in memory at a time."""
+"""Size of the pixels that are in memory at a time."""
 FACTS = (
     "run_id", "run_condition", "end_reason", "layout", "geometry", "trigger", "code", "clock", "cameras",
     "simulated", "imported", "versions",
 )  # fmt: skip
-"""What a recording says of itself that a file of its lines says, too."""
+"""Attributes of a recording that are copied into an export."""
 
 
 def recording_content(recording: Recording, rows: range | None = None) -> Content:
-    """Lines of both arms of a recording (rows; None: all) as (arm, line, pixel), with their tags and flags.
+    """Return the lines of both arms (rows; None for all) as (arm, line, pixel), with their tags and flags.
 
-    A line that is missing, or was dropped by retention, is 0 and flagged so. Rows with a step are an
-    overview: so many lines each become their mean (float32, of those that are not missing), with all their
-    flags and the first one's tags. UsageError for lines that are not there.
+    A line that is missing, or was dropped by retention, is 0 and flagged. Rows with a step make an overview:
+    each group of lines becomes its mean (float32, without missing lines), with all their flags and the tags
+    of the first. Raises UsageError for lines that the recording does not have.
     """
-    asked = range(recording.lines) if rows is None else rows
-    if not 0 <= asked.start < asked.stop <= recording.lines:
+    rows = range(recording.lines) if rows is None else rows
+    if not 0 <= rows.start < rows.stop <= recording.lines:
         first, last = recording.first_line, recording.first_line + recording.lines - 1
         raise UsageError(
-            f"lines {first + asked.start} to {first + asked.stop - 1} of {recording} are not all there",
-            possible=f"lines {first} to {last}" if recording.lines else "none: it holds no lines yet",
+            f"{recording} does not have all lines from {first + rows.start} to {first + rows.stop - 1}",
+            possible=f"lines {first} to {last}" if recording.lines else "none: it has no lines yet",
         )
-    stream, first_line = recording.arms[ARMS[0]], recording.first_line + asked.start
-    words = "lines as recorded" if asked.step == 1 else f"means of {asked.step} lines each"
+    stream, first_line = recording.arms[ARMS[0]], recording.first_line + rows.start
+    long_name = "lines as recorded" if rows.step == 1 else f"means of {rows.step} lines each"
     image = Array(
         name="lines",
         dims=("arm", "line", "pixel"),
-        shape=(len(ARMS), len(asked), stream.pixels),
-        dtype=little(stream.dtype if asked.step == 1 else np.dtype(np.float32)),
-        blocks=partial(_of_arms, recording, asked, "lines"),
-        attributes={"long_name": words, "units": "DN"},
+        shape=(len(ARMS), len(rows), stream.pixels),
+        dtype=little(stream.dtype if rows.step == 1 else np.dtype(np.float32)),
+        blocks=partial(_of_arms, recording, rows, "lines"),
+        attributes={"long_name": long_name, "units": "DN"},
     )
-    axes = (Axis("arm"), Axis("line", float(asked.step), first_line), Axis("pixel", 1.0))
-    facts = _facts(recording, asked)
     return Content(
         kind="lines",
         title=str(recording),
-        axes=axes,
+        axes=(Axis("arm"), Axis("line", float(rows.step), first_line), Axis("pixel", 1.0)),
         image=image,
-        columns=tuple(_columns(recording, asked)),
-        facts=facts,
+        columns=tuple(_columns(recording, rows)),
+        facts={
+            "source": str(recording),
+            **{key: recording.attrs[key] for key in FACTS if key in recording.attrs},
+            "first_line": recording.first_line + rows.start,
+            "lines": rows.stop - rows.start,
+            "lines_averaged": rows.step,
+            "arms": list(ARMS),
+            "line_period_s": recording.line_period_ns * 1e-9,
+            "flag_masks": {flag.name.lower(): int(flag) for flag in LineFlag if flag.name},
+            "exported_by": f"acquire {__version__}",
+        },
     )
 
 
-def _facts(recording: Recording, rows: range) -> dict[str, Any]:
-    return {
-        "source": str(recording),
-        **{key: recording.attrs[key] for key in FACTS if key in recording.attrs},
-        "first_line": recording.first_line + rows.start,
-        "lines": rows.stop - rows.start,
-        "lines_averaged": rows.step,
-        "arms": list(ARMS),
-        "line_period_s": recording.line_period_ns * 1e-9,
-        "flag_masks": {flag.name.lower(): int(flag) for flag in LineFlag if flag.name},
-        "exported_by": f"acquire {__version__}",
-    }
-
-
 def _columns(recording: Recording, rows: range) -> Iterator[Array]:
-    """Flags of each arm; what follows from the line's number is the same in both."""
+    """Yield the flags of each arm, and the tags, which are the same in both arms."""
     stream = recording.arms[ARMS[0]]
-    flags = partial(_of_arms, recording, rows, "flags")
-    words = "what is known about the line beyond its pixels"
     yield Array(
         name="flags",
         dims=("arm", "line"),
         shape=(len(ARMS), len(rows)),
         dtype=np.dtype("<u2"),
-        blocks=flags,
-        attributes={"long_name": words},
+        blocks=partial(_of_arms, recording, rows, "flags"),
+        attributes={"long_name": "what is known about the line beyond its pixels"},
     )
     tags = (
         ("time_ns", "time", "UTC at which the line's read-out begins, ns since 1970"),
         ("code_index", "code_index", "index of the code's bit in the line's first sub-step"),
         ("code", "code", "the line's code bits, first sub-step in bit 0"),
     )
-    for name, column, words in tags if rows.step == 1 else tags[:2]:
-        blocks = partial(_of_either, recording, rows, column)
-        dtype = little(stream.reader(column).shape.dtype)
+    for name, column, long_name in tags if rows.step == 1 else tags[:2]:
         yield Array(
             name=name,
             dims=("line",),
             shape=(len(rows),),
-            dtype=dtype,
-            blocks=blocks,
-            attributes={"long_name": words},
+            dtype=little(stream.reader(column).shape.dtype),
+            blocks=partial(_of_either, recording, rows, column),
+            attributes={"long_name": long_name},
         )
 
 
 def _steps(recording: Recording, rows: range) -> Iterator[tuple[int, int]]:
-    """Parts of the rows that are read at once."""
+    """Yield the parts of the rows that are read at once, as start and stop."""
     stream = recording.arms[ARMS[0]]
     size = max(1, BLOCK_BYTES // (stream.pixels * stream.dtype.itemsize * rows.step)) * rows.step
     for start in range(rows.start, rows.stop, size):
@@ -129,7 +119,7 @@ def _of_arms(recording: Recording, rows: range, name: str) -> Iterator[Block]:
 
 
 def _of_either(recording: Recording, rows: range, name: str) -> Iterator[Block]:
-    """Tags of arm a; where its line is missing, those of arm b."""
+    """Yield the tags of arm a, or those of arm b where the line of arm a is missing."""
     for start, stop in _steps(recording, rows):
         flags = {arm: flags_of(recording, arm, start, stop) for arm in ARMS}
         first, other = (present_values(recording, arm, name, start, flags[arm]) for arm in ARMS)
@@ -138,19 +128,19 @@ def _of_either(recording: Recording, rows: range, name: str) -> Iterator[Block]:
 
 
 def _place(rows: range, start: int, stop: int) -> slice:
-    """Where what becomes of these rows belongs."""
+    """Return the index in the export of these rows of the recording."""
     return slice((start - rows.start) // rows.step, -(-(stop - rows.start) // rows.step))
 
 
 def _all_flags(flags: NDArray[np.uint16], count: int) -> NDArray[np.uint16]:
-    """Every flag that one of ``count`` lines has; ``missing`` where all of them are."""
+    """Combine the flags of each group of ``count`` lines; it is ``missing`` only if all of them are."""
     edges = np.arange(0, len(flags), count)
     found: NDArray[np.uint16] = np.bitwise_or.reduceat(flags & ~MISSING, edges)
     return found | np.bitwise_and.reduceat(flags & MISSING, edges)
 
 
 def _means(lines: NDArray[Any], flags: NDArray[np.uint16], count: int) -> NDArray[np.float32]:
-    """Of ``count`` lines each, without those that are missing, which are 0."""
+    """Return the mean of each group of ``count`` lines without the missing ones, which are 0."""
     edges = np.arange(0, len(lines), count)
     total = np.add.reduceat(lines, edges, axis=0, dtype=np.float64)  # a sum of uint16 would overflow
     there = np.add.reduceat((flags & MISSING) == 0, edges, dtype=np.int64)

@@ -23,31 +23,32 @@ if TYPE_CHECKING:
     from acquire.store import VideoFile
 
 UNITS = {"micrometer": "um", "millimeter": "mm", "meter": "m", "nanometer": "nm"}
-"""UDUNITS-2 names as other programs write them."""
+"""UDUNITS-2 names → the abbreviations used by other programs."""
 
 
 def video_content(
     video: VideoFile, title: str, frames: range | None = None, *, whole: bool = False
 ) -> Content:
-    """Frames of a video (None: all), of these only the trusted ones unless ``whole``.
+    """Return frames of a video (None for all), of which only the trusted ones are kept unless ``whole``.
 
-    A video that does not say which of its frames can be trusted is exported as it is. UsageError where
-    nothing is left.
+    A video that does not record which frames are trusted is exported as it is. Raises UsageError if no frame
+    is left.
     """
     count = int(video.video.shape[0])
-    asked = range(count) if frames is None else frames
-    if not 0 <= asked.start < asked.stop <= count:
+    frames = range(count) if frames is None else frames
+    if not 0 <= frames.start < frames.stop <= count:
         raise UsageError(
-            f"frames {asked.start} to {asked.stop - 1} are not there", possible=f"0 to {count - 1}"
+            f"{title} does not have the frames {frames.start} to {frames.stop - 1}",
+            possible=f"0 to {count - 1}",
         )
     trusted = video.trusted
-    kept = asked if whole or trusted is None else _common(asked, trusted)
+    kept = frames if whole or trusted is None else _common(frames, trusted)
     if not kept:
         raise UsageError(
-            f"none of the frames {asked.start} to {asked.stop - 1} of {title} is trusted: its lines sample "
-            "them in part",
+            f"none of the frames {frames.start} to {frames.stop - 1} of {title} is trusted: its lines sample "
+            "them only in part",
             possible=f"frames {trusted.start} to {trusted.stop - 1}" if trusted else "",
-            hint="--all-frames, which marks them instead",
+            hint="--all-frames, which writes and marks them",
         )
     image = Array(
         name="video",
@@ -92,8 +93,11 @@ def _axes(video: VideoFile, kept: range) -> tuple[Axis, ...]:
 
 
 def _facts(video: VideoFile, title: str, kept: range, inside: range | None) -> dict[str, Any]:
-    """``frames`` are numbers in the source, ``trusted_frames`` in the file: the first, and after the last.
-    ``estimated_error`` is of all trusted frames of the source, in words."""
+    """Return the facts of an export of a video.
+
+    ``frames`` are numbers in the source, ``trusted_frames`` numbers in the file: the first, and after the
+    last. ``estimated_error`` describes the error of all trusted frames of the source.
+    """
     interval_s, *pixel = video.scale
     error = (video.attrs.get("provenance") or {}).get("error")
     return {
@@ -122,7 +126,7 @@ def _columns(video: VideoFile, kept: range) -> Iterator[Array]:
 
 
 def _errors(video: VideoFile, kept: range) -> tuple[Array, ...]:
-    """The estimated error of regions, where the video has it."""
+    """Return the estimated error of the regions, if the video has it."""
     if video.error is None:
         return ()
     return (
@@ -137,8 +141,8 @@ def _errors(video: VideoFile, kept: range) -> tuple[Array, ...]:
     )
 
 
-def _column(name: str, values: NDArray[Any], words: str) -> Array:
-    """A value for each frame, in memory."""
+def _column(name: str, values: NDArray[Any], long_name: str) -> Array:
+    """Make a column that holds one value per frame in memory."""
     piece = block((slice(0, len(values)),), values)
     return Array(
         name=name,
@@ -146,12 +150,12 @@ def _column(name: str, values: NDArray[Any], words: str) -> Array:
         shape=values.shape,
         dtype=piece[1].dtype,
         blocks=lambda: iter([piece]),
-        attributes={"long_name": words},
+        attributes={"long_name": long_name},
     )
 
 
 def _frames(array: zarr.Array[Any], kept: range, what: str) -> Iterator[Block]:
-    """Whole chunks, so that none is unpacked twice."""
+    """Yield frames by whole chunks, so that none is decompressed twice."""
     size, start = int(array.chunks[0]), kept.start
     while start < kept.stop:
         stop = min(kept.stop, (start // size + 1) * size)

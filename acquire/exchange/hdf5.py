@@ -1,11 +1,11 @@
-"""HDF5 as NeXus: an NXentry with one NXdata, whose default plot is the image, and an NXprocess that made it.
+"""HDF5 in NeXus layout: an NXentry with one NXdata, whose default plot is the image, and its NXprocess.
 
 ::
 
     /entry            NXentry    default = "data"
       data            NXdata     signal = "video" | "lines"; axes and columns along them
-      error           NXdata     of a video: its estimated error over frames and regions, where it is known
-      process         NXprocess  program, version, and in note/data the facts as JSON
+      error           NXdata     estimated error of a video over frames and regions, if it is known
+      process         NXprocess  program, version, and the facts as JSON in note/data
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ CHUNK_BYTES = 2**20
 
 
 def write_hdf5(path: Path, content: Content, advance: Callable[[int], object]) -> None:
-    """Raises OSError as HDF5 gives it."""
+    """Write a NeXus file. Raises OSError from HDF5."""
     h5py = library("h5py", "export", "an HDF5 file")
     with h5py.File(path, "w") as file:
         file.attrs.update({"default": "entry", "creator": f"acquire {__version__}"})
@@ -64,7 +64,7 @@ def _group(parent: Any, name: str, kind: str, **attributes: str) -> Any:
 
 
 def _write_axis(data: Any, axis: Axis, count: int) -> None:
-    """Coordinates, a chunk at a time: lines can be many."""
+    """Write coordinates chunk by chunk, since there can be very many lines."""
     assert axis.step is not None
     whole = axis.step == int(axis.step) and axis.first == int(axis.first)
     dataset = data.create_dataset(axis.name, (count,), "<i8" if whole else "<f8")
@@ -76,7 +76,7 @@ def _write_axis(data: Any, axis: Axis, count: int) -> None:
 
 
 def _write(data: Any, array: Array, advance: Callable[[int], object]) -> None:
-    """In chunks of about `CHUNK_BYTES`: frames, or lines of one arm, since no block has lines of both."""
+    """Write an array in chunks of about `CHUNK_BYTES`: frames, or lines of one arm, like its blocks."""
     ahead = 1 if array.dims[0] == "arm" else 0
     row_bytes = array.dtype.itemsize * int(np.prod(array.shape[ahead + 1 :]))
     rows = min(array.shape[ahead], max(1, CHUNK_BYTES // row_bytes))

@@ -1,8 +1,8 @@
-"""Lines of other programs as a sealed recording, which says what is not known of them.
+"""Import of other programs' lines as a sealed recording, which states what is not known about them.
 
-No tag of a trigger stands behind such lines: which bit of the code belongs to which line, and when it was
-read out, follows from what the user says, and every line is flagged so (``code_unverified``,
-``time_estimated``). `acquire diagnose` holds the lines against the code.
+Such lines have no tags of a trigger: the code bits of each line and the time of its read-out follow from the
+user's arguments, and every line is flagged accordingly (``code_unverified``, ``time_estimated``). `acquire
+diagnose` checks the lines against the code.
 """
 
 from __future__ import annotations
@@ -36,16 +36,16 @@ if TYPE_CHECKING:
 BLOCK_LINES = 4096
 COMMIT_BLOCKS = 64
 SUBSTEP_TICKS = 1000
-"""Where only the line rate is known: the clock is then that many times as fast as the sub-steps."""
+"""Ticks per sub-step of the clock if only the line rate is known."""
 UNKNOWN_NS = 2**62
-"""Uncertainty of a clock of which nothing is known."""
+"""Uncertainty of an unknown clock."""
 NO_ARM = "not_imported"
-"""Why the lines of an arm are missing that no file has."""
+"""Reason for the missing lines of an arm without a file."""
 
 
 @dataclass(frozen=True, slots=True)
 class Instrument:
-    """What the lines were taken with.
+    """The instrument that captured the lines.
 
     Attributes
     ----------
@@ -53,9 +53,9 @@ class Instrument:
     code, code_start : the light's code; its bit in the first sub-step of line 0
     clock_hz, substep_ticks : ticks per second, and of a sub-step
     cameras : per arm ``white_dn``, ``black_level_dn`` and ``responsivity_dn``, as far as they are known
-    start_ns : UTC at which the first line's read-out begins; None: not known
-    config : the rig's configuration, where there is one
-    fibre : which column sees what, of layout ``fibre``
+    start_ns : UTC at which the first line's read-out begins; None if unknown
+    config : the configuration of the rig, if there is one
+    fibre : position of the fibre bands, for the layout ``fibre``
     """
 
     stages: int
@@ -73,7 +73,7 @@ class Instrument:
 
     @property
     def pixels(self) -> int:
-        """Of a line of either arm."""
+        """Number of pixels in a line of either arm."""
         return self.stages if self.fibre is None else self.fibre.sensor_pixels
 
     @property
@@ -83,7 +83,7 @@ class Instrument:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Arm:
-    """The lines of one arm: a file, and which of its arms where it has two."""
+    """The lines of one arm: a file, and the number of the arm if the file has two."""
 
     file: LineFile
     number: int | None = None
@@ -91,7 +91,7 @@ class Arm:
 
 @dataclass(frozen=True, slots=True)
 class Imported:
-    """What was written."""
+    """The recording that was written, and what is not known about its lines."""
 
     path: Path | str
     lines: int
@@ -100,7 +100,7 @@ class Imported:
 
 
 def clock_of(line_rate_hz: float, substeps: int) -> tuple[int, int]:
-    """Ticks per second, and per sub-step, of a clock that gives a line rate, to a part in 10⁸ or better."""
+    """Return ticks per second and per sub-step of a clock for a line rate, to a part in 10⁸ or better."""
     ticks = SUBSTEP_TICKS
     while line_rate_hz * substeps * ticks < 1e8:
         ticks *= 10
@@ -116,10 +116,11 @@ def import_lines(
     *,
     most_lines: int | None = None,
 ) -> Imported:
-    """Write the lines of one or both arms, at most so many, as a new, sealed recording at a path or URL.
+    """Write up to ``most_lines`` lines of one or both arms as a new, sealed recording at a path or URL.
 
-    Whole or not at all. UsageError for lines, a code and a geometry that do not fit together, before anything
-    is touched; DataError for a file that cannot be read, StoreError where the disk refuses.
+    It is written completely or not at all. Raises UsageError, before anything is written, if the lines, the
+    code and the geometry do not fit together; DataError for a file that cannot be read, StoreError for errors
+    of the disk.
     """
     lines = _checked(arms, instrument, most_lines)
     unknown = tuple(_unknown(arms, instrument))
@@ -140,7 +141,7 @@ def import_lines(
 
 
 def _checked(arms: Mapping[str, Arm], instrument: Instrument, most_lines: int | None) -> int:
-    """The number of lines, once all fits together."""
+    """Return the number of lines. Raises UsageError if the files do not fit each other or the instrument."""
     counts = {arm: source.file.lines for arm, source in arms.items()}
     if most_lines is not None:
         if not 1 <= most_lines <= min(counts.values()):
@@ -151,8 +152,8 @@ def _checked(arms: Mapping[str, Arm], instrument: Instrument, most_lines: int | 
     if len(set(counts.values())) > 1:
         raise UsageError(
             f"arm a has {counts['a']} lines, and arm b {counts['b']}",
-            possible="as many of one as of the other, line by line",
-            hint=f"--lines {min(counts.values())} takes so many of each",
+            possible="the same number of lines in both arms",
+            hint=f"--lines {min(counts.values())}, to take this number of each",
         )
     if len({source.file.dtype.newbyteorder("=") for source in arms.values()}) > 1:
         raise UsageError("the arms have different types", possible="uint8 or uint16 for both")
@@ -160,14 +161,15 @@ def _checked(arms: Mapping[str, Arm], instrument: Instrument, most_lines: int | 
         if instrument.fibre is not None and source.file.pixels != instrument.pixels:
             raise UsageError(
                 f"lines of arm {arm} have {source.file.pixels} pixels, with sensors of {instrument.pixels}",
-                possible="lines as wide as the sensors behind the fibre: [fibre] sensor_pixels of the rig",
-                hint=f"--columns-{arm} FIRST:END chooses the pixels that are the sensor's",
+                possible="lines as wide as the sensors behind the fibre: [fibre] sensor_pixels of the rig "
+                "file",
+                hint=f"--columns-{arm} FIRST:END, to select the pixels of the sensor",
             )
         if source.file.pixels != instrument.pixels:
             raise UsageError(
                 f"lines of arm {arm} have {source.file.pixels} pixels, with {instrument.stages} stages",
-                possible="as many pixels as stages, M: lines are as long as the image is high",
-                hint=f"--columns-{arm} FIRST:END chooses the pixels that are lit, --stages their number",
+                possible="as many pixels as stages (M)",
+                hint=f"--columns-{arm} FIRST:END, to select the lit pixels; --stages, to set their number",
             )
     lines = next(iter(counts.values()))
     _check_code(instrument, lines)
@@ -175,7 +177,7 @@ def _checked(arms: Mapping[str, Arm], instrument: Instrument, most_lines: int | 
 
 
 def _check_code(instrument: Instrument, lines: int) -> None:
-    """Listed bits must last for all sub-steps that the lines touch."""
+    """Raise UsageError if the listed bits do not last for all sub-steps of the lines."""
     code = instrument.code
     if not isinstance(code, ListedCode) or code.repeats:
         return
@@ -184,13 +186,13 @@ def _check_code(instrument: Instrument, lines: int) -> None:
     if code.length < needed:
         raise UsageError(
             f"the code has {code.length} bits, and {lines} lines touch {needed}",
-            possible="S·(M + lines) − 1 bits from the first line's on",
-            hint="--code-repeats where the sequence begins anew, or fewer --lines",
+            possible="S·(M + lines) − 1 bits, starting with the first line's",
+            hint="--code-repeats, if the sequence repeats, or fewer --lines",
         )
 
 
 def shifted(code: Code, start: int) -> Code:
-    """The code whose bit 0 is bit ``start`` of another one."""
+    """Return the code whose bit 0 is bit ``start`` of the given code."""
     if start == 0:
         return code
     if isinstance(code, PrbsCode):
@@ -198,13 +200,13 @@ def shifted(code: Code, start: int) -> Code:
     if isinstance(code, ListedCode):
         count = code.length if code.repeats else code.length - start
         if count < 1:
-            raise UsageError(f"--code-start {start} is after the last of {code.length} bits")
+            raise UsageError(f"--code-start {start} is beyond the {code.length} bits of the code")
         return ListedCode.of(code.bits(start, count), repeats=code.repeats)
     return code
 
 
 def _unknown(arms: Mapping[str, Arm], instrument: Instrument) -> list[str]:
-    """What the recording cannot say of its lines, in words."""
+    """List what is not known about the lines. The texts are stored in the recording."""
     found = ["the trigger's tags: code and time of every line follow from what was said at the import"]
     found.append("lines that were lost before: a loss shifts the code of all that follow")
     if instrument.start_ns is None:
@@ -231,7 +233,7 @@ def _cameras(instrument: Instrument, dtype: np.dtype[Any]) -> dict[str, Any]:
 
 
 def _clock(instrument: Instrument) -> ClockFit:
-    """UTC of tick 0, so that the first line is read out when it is said to be."""
+    """Return a clock whose tick 0 is placed so that the first line is read out at the given time."""
     geometry = Geometry(instrument.stages, instrument.substeps, 1)
     substep = instrument.substeps * instrument.first_line + geometry.readout_substep
     relative = ClockFit(instrument.clock_hz, 0, UNKNOWN_NS)
@@ -244,7 +246,7 @@ def _spec(
 ) -> RecordingSpec:
     file = next(iter(arms.values())).file
     dtype = file.dtype.newbyteorder("=")
-    # Of a short import no chunk is much longer than the lines there are: the rest would be filler.
+    # A short import gets chunks not much longer than its lines, since the rest would be padding.
     chunk_lines = min(
         usual_chunk_lines(file.pixels * dtype.itemsize, instrument.line_rate_hz),
         1 << max(4, lines.bit_length()),

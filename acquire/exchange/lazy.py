@@ -1,4 +1,4 @@
-"""Arrays for viewers, which read only what is looked at, however long a recording is."""
+"""Lazy arrays for viewers, which read only what is shown, however long a recording is."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ if TYPE_CHECKING:
 PAGE_LINES = 1024
 """Lines of a recording that are shown as one picture."""
 MOST_BYTES = 2**29
-"""Of what is read at once: a viewer that asks for more would fill the memory."""
+"""Largest size that is read at once, so that a viewer cannot fill the memory."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Stack:
-    """Pictures (number, row, column) that ``picture`` reads one by one; sliced as NumPy's arrays are."""
+    """Pictures (number, row, column) that ``picture`` reads one by one; it is sliced like a NumPy array."""
 
     shape: tuple[int, int, int]
     dtype: np.dtype[Any]
@@ -44,7 +44,7 @@ class Stack:
         return self.shape[0]
 
     def __getitem__(self, index: Any) -> NDArray[Any]:
-        """UsageError for more than `MOST_BYTES`."""
+        """Read the selected pictures. Raises UsageError for more than `MOST_BYTES`."""
         first, *rest = index if isinstance(index, tuple) else (index,)
         numbers = np.arange(self.shape[0])[first]
         if numbers.ndim == 0:
@@ -53,9 +53,9 @@ class Stack:
         wanted = len(numbers) * math.prod(self.shape[1:]) * self.dtype.itemsize
         if wanted > MOST_BYTES:
             raise UsageError(
-                f"{len(numbers)} pictures at once are {wanted} bytes",
-                possible=f"up to {MOST_BYTES}",
-                hint="one after the other, by the slider; acquire export for a part",
+                f"{len(numbers)} pictures at once would be {wanted} bytes",
+                possible=f"up to {MOST_BYTES} bytes",
+                hint="the slider, for one picture at a time; acquire export, for a part",
             )
         found = np.empty((len(numbers), *self.shape[1:]), self.dtype)
         for place, number in zip(found, numbers.tolist(), strict=True):
@@ -67,7 +67,7 @@ class Stack:
 
 
 def pages(recording: Recording, arm: str) -> Stack:
-    """Lines of an arm in pages of `PAGE_LINES`; missing lines and what fills up the last page are 0."""
+    """Return the lines of an arm in pages of `PAGE_LINES`; missing lines and padding are 0."""
     stream, lines = recording.camera(arm), recording.lines
 
     def picture(number: int) -> NDArray[Any]:
@@ -82,7 +82,7 @@ def pages(recording: Recording, arm: str) -> Stack:
 
 
 def frames(video: VideoFile, kept: range) -> Stack:
-    """Some frames of a video."""
+    """Return some frames of a video."""
     _, rows, columns = video.video.shape
 
     def picture(number: int) -> NDArray[Any]:

@@ -1,4 +1,4 @@
-"""Libraries that one format of files needs, and the core does not."""
+"""Libraries that only one file format needs."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from acquire.errors import UsageError
 
 
 def library(module: str, extra: str, what: str) -> Any:
-    """The module. UsageError with the command that installs it, where it is missing."""
+    """Import a module. Raises UsageError with the command that installs it if it is missing."""
     try:
         return import_module(module)
     except ModuleNotFoundError as error:

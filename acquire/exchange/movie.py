@@ -1,4 +1,4 @@
-"""MP4 (H.264): a video for people, in 8 bits of grey; its facts are in the comment of the file."""
+"""MP4 (H.264): a video for viewing, in 8-bit grey, with its facts in the comment of the file."""
 
 from __future__ import annotations
 
@@ -19,23 +19,24 @@ if TYPE_CHECKING:
 
 PEAK_QUANTILE = 0.999
 SAMPLED = 65_536
-"""Voxels of a block that are looked at to find out what is white."""
+"""Number of voxels of a block that are sampled to find the white level."""
 MOST_SIDE = 8192
 USUAL_SIDE = 256
-"""Of a movie: a smaller video is enlarged by a whole factor, pixel by pixel, to about that."""
+"""Usual side of a movie: a smaller video is enlarged to about this size by an integer factor."""
 
 
 def check_movie(content: Content) -> None:
-    """UsageError for what is no video, or a video that H.264 cannot hold."""
+    """Raise UsageError for content that is not a video, or for a video that H.264 cannot hold."""
     if content.kind != "video":
         raise UsageError(
-            f"{content.title} cannot become a movie: it is a recording, whose lines are no pictures",
+            f"{content.title} cannot become a movie: it is a recording, whose lines are not pictures",
             possible=".tif, .ome.tif, .h5, .npy, .npz",
             hint="acquire reconstruct, and export its video",
         )
     if max(content.image.shape[1:]) > MOST_SIDE:
         raise UsageError(
-            f"an MP4 file cannot have {content.image.shape[1:]} pixels", possible=f"up to {MOST_SIDE}"
+            f"an MP4 file cannot have {content.image.shape[1:]} pixels",
+            possible=f"up to {MOST_SIDE} pixels along each side",
         )
     library("av", "video", "an MP4 file")
 
@@ -43,7 +44,7 @@ def check_movie(content: Content) -> None:
 def write_movie(
     path: Path, content: Content, advance: Callable[[int], object], fps: float, peak: float | None
 ) -> None:
-    """``fps`` frames a second, grey linear from 0 to ``peak`` (None: nearly the brightest)."""
+    """Write a movie of ``fps`` frames per second, grey from 0 to ``peak`` (None: close to the brightest)."""
     av = library("av", "video", "an MP4 file")
     white = peak or _white(content)
     times = max(1, USUAL_SIDE // max(content.image.shape[1:]))
@@ -58,7 +59,7 @@ def write_movie(
         stream.width, stream.height = width + width % 2, height + height % 2
         for _, block in content.image.blocks():
             for frame in block:
-                # The codec wants even sides: an odd one gets its last row or column twice.
+                # The codec needs even sides, so an odd one repeats its last row or column.
                 grey = np.rint(np.clip(frame.astype(np.float32) * (255 / white), 0, 255)).astype(np.uint8)
                 large = grey.repeat(times, axis=0).repeat(times, axis=1)
                 even = np.pad(large, [(0, side % 2) for side in large.shape], mode="edge")
@@ -69,7 +70,7 @@ def write_movie(
 
 
 def _white(content: Content) -> float:
-    """Nearly the brightest voxel, from some of every block."""
+    """Return a value close to the brightest voxel, from a sample of every block."""
     found = [0.0]
     for _, block in content.image.blocks():
         some = block.reshape(-1)[:: max(1, block.size // SAMPLED)]

@@ -1,7 +1,7 @@
 """Videos and recordings in napari: ``napari --plugin tdi-acquire NAME.zarr``.
 
-``napari.toml`` beside this file is the manifest that napari finds by its entry point. Nothing here imports
-napari: a reader answers with plain tuples of data, options and the kind of layer.
+``napari.toml`` next to this file is the manifest that napari finds through its entry point. Nothing here
+imports napari: a reader returns plain tuples of data, options and layer type.
 """
 
 from __future__ import annotations
@@ -22,13 +22,13 @@ if TYPE_CHECKING:
 
 Layer = tuple[Any, dict[str, Any], str]
 SAMPLED = 5
-"""Pages that are looked at to find what is black and white."""
+"""Number of pages that are sampled to find the black and white levels."""
 GAP = 8
-"""Pixels between the arms, which lie side by side."""
+"""Pixels between the arms, which are shown side by side."""
 
 
 def reader_for(path: str | list[str]) -> Callable[[Any], list[Layer]] | None:
-    """What reads a path; None for what is no recording and no video of ours, which other readers may know."""
+    """Return the reader for a path; None if it is neither a recording nor a video of ours."""
     if not isinstance(path, str):
         return None
     try:
@@ -41,12 +41,12 @@ def reader_for(path: str | list[str]) -> Callable[[Any], list[Layer]] | None:
 
 
 def read_video(path: Any) -> list[Layer]:
-    """The trusted frames as one image; all of them where none is, and its name says so."""
+    """Return the trusted frames as one image; all frames if none is trusted, which its name then states."""
     file = open_video(str(path))
     trusted = file.trusted
     kept = trusted or range(len(file.time_ns))
-    words = "not known which frames are trusted" if trusted is None else "no frame is trusted"
-    name = f"{_name(path)} ({f'frames {kept.start} to {kept.stop - 1}' if trusted else words})"
+    reason = "not known which frames are trusted" if trusted is None else "no frame is trusted"
+    name = f"{_name(path)} ({f'frames {kept.start} to {kept.stop - 1}' if trusted else reason})"
     step, origin = file.scale, file.origin
     options = {
         "name": name,
@@ -64,20 +64,21 @@ def read_video(path: Any) -> list[Layer]:
 
 
 def read_recording(path: Any) -> list[Layer]:
-    """The lines of both arms side by side, in pages that the slider turns; where there is one, an overview.
+    """Return the lines of both arms side by side, in pages for the slider, and an overview if there is one.
 
-    The overview lies beside them, hidden: who shows it sees the whole recording at once.
+    The overview is hidden at first; it shows the whole recording at once.
     """
     recording = open_recording(str(path))
     arms = [_arm(recording, arm, number) for number, arm in enumerate(ARMS)]
-    return [*(layer for arm in ARMS for layer in _overview(recording, arm, arms)), *arms]
+    overviews = [_overview(recording, arm, layer) for arm, layer in zip(ARMS, arms, strict=True)]
+    return [*(layer for layer in overviews if layer is not None), *arms]
 
 
-def _overview(recording: Recording, arm: str, arms: list[Layer]) -> list[Layer]:
+def _overview(recording: Recording, arm: str, lines: Layer) -> Layer | None:
     found = recording.overview(arm)
     if found is None:
-        return []
-    _, place, _ = arms[ARMS.index(arm)]
+        return None
+    _, place, _ = lines
     options = {
         "name": f"{_name(recording)}, arm {arm}, overview ({found.lines_per_row} lines a row)",
         "translate": place["translate"][1:],
@@ -87,7 +88,7 @@ def _overview(recording: Recording, arm: str, arms: list[Layer]) -> list[Layer]:
         "rgb": False,
         "metadata": {"first_line": found.first_line, "lines_per_row": found.lines_per_row},
     }
-    return [(found.rows, options, "image")]
+    return found.rows, options, "image"
 
 
 def _arm(recording: Recording, arm: str, number: int) -> Layer:
@@ -108,7 +109,7 @@ def _name(path: object) -> str:
 
 
 def _window(file: VideoFile) -> tuple[float, float]:
-    """Black and white as the video says, or, of an older one, from some of its frames."""
+    """Return the black and white levels recorded in the video; for an older one, from some of its frames."""
     channels = file.attrs["ome"].get("omero", {}).get("channels", ())
     for channel in channels:
         return float(channel["window"]["start"]), float(channel["window"]["end"])

@@ -1,8 +1,8 @@
-"""TIFF: an ImageJ hyperstack, or, as ``.ome.tif``, an OME-TIFF of any size.
+"""TIFF: an ImageJ hyperstack, or an OME-TIFF of any size (``.ome.tif``).
 
-The image lies in one piece behind the header, so that it is written as it is read, block by block. What lies
-beside it is a second image of an OME-TIFF. A hyperstack has none: a page behind its frames is one more frame
-to Bio-Formats and to others.
+The image is contiguous behind the header, so that it can be written block by block as it is read.
+Accompanying arrays become a second image of an OME-TIFF. A hyperstack has none, because Bio-Formats and
+others would show a page behind its frames as one more frame.
 """
 
 from __future__ import annotations
@@ -23,24 +23,24 @@ if TYPE_CHECKING:
     from acquire.exchange.content import Content
 
 MOST_BYTES = 2**32 - 2**26
-"""Of an image in a file whose offsets have 32 bits."""
+"""Largest image in a file with 32-bit offsets."""
 AXES = {"video": "TYX", "lines": "CYX"}
-"""Letters of ImageJ and OME: the arms of a recording are channels, its lines rows."""
+"""Axis letters of ImageJ and OME: the arms of a recording are channels, its lines are rows."""
 
 
 def check_tiff(content: Content, *, ome: bool) -> None:
-    """UsageError for an image that no such file can hold."""
+    """Raise UsageError for an image that such a file cannot hold."""
     library("tifffile", "export", "a TIFF file")
     if not ome and content.image.bytes > MOST_BYTES:
         raise UsageError(
             f"a TIFF file for ImageJ cannot hold {content.image.bytes} bytes of pixels",
-            possible=f"up to {MOST_BYTES}",
-            hint="NAME.ome.tif, which can, or NAME.h5; or a part: --from and --to",
+            possible=f"up to {MOST_BYTES} bytes",
+            hint="NAME.ome.tif or NAME.h5, which can; or a part, with --from and --to",
         )
 
 
 def write_tiff(path: Path, content: Content, advance: Callable[[int], object], *, ome: bool) -> None:
-    """Raises OSError as the disk gives it."""
+    """Write a TIFF file. Raises OSError from the disk."""
     tifffile = library("tifffile", "export", "a TIFF file")
     kind: dict[str, Any] = {"ome": True, "bigtiff": True} if ome else {"imagej": True}
     beside, (*_, y, x) = content.beside if ome else (), content.axes
@@ -58,7 +58,7 @@ def write_tiff(path: Path, content: Content, advance: Callable[[int], object], *
             about = {"axes": "TYX", "Name": array.name, "Description": json.dumps(array.attributes)}
             empty = {"shape": array.shape, "dtype": array.dtype, "photometric": "minisblack"}
             writer.write(None, **empty, metadata=about)
-    # The writer has left room for the pixels; only a reader of the finished headers knows where.
+    # The writer has left space for the pixels. Its position is known only from the finished headers.
     with tifffile.TiffFile(path) as reader:
         places = [each.dataoffset for each in reader.series]
     with path.open("r+b") as file:
@@ -90,5 +90,5 @@ def _ome(content: Content) -> dict[str, Any]:
         letter, unit = axis.name.upper(), "µm" if axis.unit == "um" else axis.unit
         facts |= {f"PhysicalSize{letter}": axis.step, f"PhysicalSize{letter}Unit": unit}
     began = datetime.fromtimestamp(content.facts["first_frame_utc_ns"] // 10**9, UTC).replace(tzinfo=None)
-    facts["AcquisitionDate"] = began.isoformat()  # of OME: UTC, without saying so
+    facts["AcquisitionDate"] = began.isoformat()  # OME expects UTC without a time zone
     return {**facts, "TimeIncrement": time.step, "TimeIncrementUnit": "s"}

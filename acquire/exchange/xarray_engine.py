@@ -1,8 +1,8 @@
 """``xarray.open_dataset(PLACE, engine="acquire")``: videos and recordings with all their coordinates.
 
-xarray finds this by its entry point and imports it, nobody else does. What it adds to xarray's own engine is
-``line`` as a coordinate, which costs nothing however many lines there are, and a video's coordinates without
-a word about consolidated metadata.
+Only xarray imports this module, through its entry point. Compared with xarray's own Zarr engine it adds
+``line`` as a coordinate, which takes no memory however many lines there are, and opens a video with its
+coordinates without an argument for consolidated metadata.
 """
 
 from __future__ import annotations
@@ -24,13 +24,13 @@ if TYPE_CHECKING:
     from acquire.store import Recording
 
 IMAGE = "video"
-"""What the image of a video is called; in the file it is the level 0."""
+"""Name of a video's image in the dataset; in the file it is level 0."""
 
 
 class AcquireBackend(BackendEntrypoint):
-    """Opens lazily: nothing but metadata is read, and a video's time stamps."""
+    """Opens lazily: only metadata and the time stamps of a video are read."""
 
-    description = "recordings and videos of acquire, with their coordinates"
+    description = "acquire recordings and videos, with their coordinates"
     open_dataset_parameters = ("filename_or_obj", "drop_variables", "group")
 
     def open_dataset(
@@ -40,7 +40,7 @@ class AcquireBackend(BackendEntrypoint):
         drop_variables: str | Iterable[str] | None = None,
         group: str | None = None,
     ) -> xarray.Dataset:
-        """A video, or one arm of a recording (``group``, "a" or "b"; else a). Raises as `open_recording`."""
+        """Open a video, or an arm of a recording (``group``, default "a"). Raises as `open_recording`."""
         place = str(filename_or_obj)
         if (format_of(place) or "").startswith("acquire-video/"):
             dataset = _video(place, group)
@@ -50,7 +50,7 @@ class AcquireBackend(BackendEntrypoint):
         return dataset.drop_vars(names)
 
     def guess_can_open(self, _: Any) -> bool:
-        """Only where it is named: xarray's Zarr engine is not pushed aside."""
+        """Return False: the engine is used only by name and does not displace xarray's Zarr engine."""
         return False
 
 

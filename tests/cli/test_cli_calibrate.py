@@ -34,7 +34,7 @@ def test_step_by_step_to_a_page(cli: Cli, taken: dict[str, Path], tmp_path: Path
         answer = cli("calibrate", step, taken[recording], "--out", cal)
         assert answer.code == 0, answer.err
         assert f"{step}, 512 lines" in answer.out
-        assert f"kept in  {cal}" in answer.out
+        assert f"saved in  {cal}" in answer.out
         said[step] = answer.out
     assert "uncertain by" in said["dark"]
     assert "arm A's part of the light" in said["flat"]

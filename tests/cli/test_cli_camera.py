@@ -102,7 +102,7 @@ def test_wrong_words_touch_nothing(cli: Cli, tmp_path: Path) -> None:
             ("SIM-C", "-c", "rig-demo", "--out", tmp_path / "x.png"),
             "no camera 'SIM-C'\n  possible: SIM-A, SIM-B",
         ),
-        (("SIM-A", "-c", "rig-demo", "--out", taken), "exists and stays untouched"),
+        (("SIM-A", "-c", "rig-demo", "--out", taken), "exists and is not overwritten"),
         (("SIM-A", "-c", "rig-demo", "--out", tmp_path / "x.jpg"), "possible: .png, .npy"),
     ):
         answer = cli("camera", "snapshot", *words)

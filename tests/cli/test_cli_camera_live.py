@@ -17,7 +17,7 @@ import pytest
 from rich.console import Console
 
 from acquire.camera.gauge import Reading
-from acquire.cli.camera_screen import Screen, bar, running, words
+from acquire.cli.camera_screen import Screen, bar, reading_text, sparkline
 from acquire.config import load_rig
 from acquire.rig import Rig
 from acquire.sim.lines import StreamingArm
@@ -77,14 +77,14 @@ def test_the_screen_says_what_is_wrong() -> None:
     screen.show({"a": Reading(100, 0, 0.5, 1.0, 0.01, 0.2), "b": Reading(0)})
     shown = _drawn(screen)
     assert "\x1b" not in shown
-    assert "saturated: less light" in shown
-    assert "no lines come" in shown
+    assert "saturated: use less light" in shown
+    assert "no lines are arriving" in shown
     assert bar(0.5).count("█") == 16
-    line = running([1.0, 2.0, 3.0])
+    line = sparkline([1.0, 2.0, 3.0])
     assert (line[0], line[-1]) == ("▁", "█")
-    assert set(running([1.0, 1.0001, 0.9999])) <= set("▄▅")  # nothing but noise
-    assert words(Reading(9, 0, 0.02, 0.1, 0.0, 0.3)).endswith(
-        "focus 30.00% (dim: more light, or a larger aperture)"
+    assert set(sparkline([1.0, 1.0001, 0.9999])) <= set("▄▅")  # nothing but noise
+    assert reading_text(Reading(9, 0, 0.02, 0.1, 0.0, 0.3)).endswith(
+        "focus 30.00% (dim: use more light or a larger aperture)"
     )
 
 

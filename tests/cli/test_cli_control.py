@@ -103,7 +103,7 @@ def test_status_in_words(cli: Cli, answering: Callable[[Status], FakeClient]) ->
     answering(status(State.RECORDING, recording=now, run_id="r-1", busy="stop"))
     out = cli("status").out
     assert "recording since 2025-01-02 03:04:05 UTC" in out
-    assert "/d/x.zarr, 500 of 900 lines from line 40 on, 256 readable" in out
+    assert "/d/x.zarr, 500 of 900 lines from line 40, 256 readable" in out
     assert "process 42" in out
     arm = {name: words for name, *words in (line.split() for line in out.rpartition("\n\n")[2].splitlines())}
     assert arm["arm"] == ["a"]
@@ -166,7 +166,7 @@ def test_durations_in_words(text: str, value: float) -> None:
 def test_what_is_no_duration_is_refused(cli: Cli, text: str) -> None:
     answer = cli("start", f"--pre={text}")
     assert answer.code == 2
-    assert "is no duration: 2s, 500ms" in " ".join(answer.err.split())
+    assert "is not a duration, such as 2s, 500ms" in " ".join(answer.err.split())
 
 
 class Terminal(io.StringIO):
@@ -207,7 +207,7 @@ def test_status_fits_the_terminal(
     lines = terminal.getvalue().splitlines()
     assert max(map(len, lines)) <= columns
     words = " ".join(" ".join(lines).split())
-    assert "run-of-the-valve-7.zarr, 500000 of 900000 lines from line 40 on, 256 readable" in words
+    assert "run-of-the-valve-7.zarr, 500000 of 900000 lines from line 40, 256 readable" in words
     assert "/data/2025/recordings, 1 TB free, full in 16.7 min at 1 GB/s" in words
     assert "SILENT for 8 s, 123456 lines, clock 90 MHz, UTC known to 1.2 us" in words
     assert "uploads: ValueError: \\x1b[31m (3 times)" in words

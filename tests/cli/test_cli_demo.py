@@ -22,7 +22,7 @@ Cli = Callable[..., Any]
     [
         (("--lines", 1000), "1996 or more"),
         (("--budget", 0), "more than 0"),
-        (("--twist-budget", "nan"), "is no duration"),
+        (("--twist-budget", "nan"), "is not a duration"),
         (("--config", "none.toml"), "does not exist"),
     ],
 )

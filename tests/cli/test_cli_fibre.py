@@ -100,8 +100,8 @@ def test_a_part_and_a_preview(cli: Cli, recording: Path, tmp_path: Path) -> None
             ("--nm", 3),
             "voxels of N_m = 3 do not fill the tiles behind the fibre, which are 16 fine pixels wide",
         ),
-        (("--try-orientations",), "--try-orientations cannot turn lines behind a fibre"),
-        (("--search", "none"), "--search none is not known possible: each, shared"),
+        (("--try-orientations",), "--try-orientations cannot be used behind a fibre"),
+        (("--search", "none"), "there is no --search none possible: each, shared"),
     ],
 )
 def test_what_cannot_be_is_refused_before_anything_is_made(

@@ -16,7 +16,7 @@ from collections.abc import Callable
 import pytest
 
 from acquire.cli import progress as module
-from acquire.cli.interrupts import END_NOW, _Presses, first_interrupt_asks, interrupts_answered
+from acquire.cli.interrupts import END_NOW, _Presses, interrupts_handled, stop_on_interrupt
 from acquire.cli.progress import Progress, span
 
 LIMIT_S = 30.0
@@ -85,7 +85,7 @@ def test_what_will_take_long_says_so_once_with_what_is_quicker(capsys: pytest.Ca
         progress._first = (progress._first[0] - 10, 1)
         progress.advance(2, 1000)
     said = capsys.readouterr().err.splitlines()
-    assert said == ["acquire: reconstructing will take about 2 h 46 min; in less time: --preview"]
+    assert said == ["acquire: reconstructing will take about 2 h 46 min; quicker: --preview"]
 
 
 @pytest.mark.parametrize(
@@ -121,7 +121,7 @@ def test_ctrl_c_is_answered_before_anything_ends(
     monkeypatch.setattr("acquire.cli.interrupts.SAME_S", 0.0)
 
     def interrupted() -> None:
-        with interrupts_answered():
+        with interrupts_handled():
             try:
                 signal.raise_signal(signal.SIGINT)
             finally:  # before whatever takes its time to end
@@ -130,7 +130,7 @@ def test_ctrl_c_is_answered_before_anything_ends(
     said: list[str] = []
     with pytest.raises(KeyboardInterrupt):
         interrupted()
-    assert said == ["acquire: interrupted, ending; Ctrl-C once more to end now\n"]
+    assert said == ["acquire: interrupted, ending; press Ctrl-C again to end now\n"]
 
 
 def test_the_first_ctrl_c_finishes_and_the_second_ends(
@@ -139,7 +139,7 @@ def test_the_first_ctrl_c_finishes_and_the_second_ends(
     monkeypatch.setattr("acquire.cli.interrupts.SAME_S", 0.0)
 
     def interrupted_twice() -> None:
-        with interrupts_answered(), first_interrupt_asks("finishing the segment") as asked:
+        with interrupts_handled(), stop_on_interrupt("finishing the segment") as asked:
             signal.raise_signal(signal.SIGINT)
             assert asked.is_set()
             said.append(capsys.readouterr().err)
@@ -148,7 +148,7 @@ def test_the_first_ctrl_c_finishes_and_the_second_ends(
     said: list[str] = []
     with pytest.raises(KeyboardInterrupt):
         interrupted_twice()
-    assert said == ["acquire: finishing the segment; Ctrl-C once more to end now\n"]
+    assert said == ["acquire: finishing the segment; press Ctrl-C again to end now\n"]
     for thread in threading.enumerate():
         if thread.name == END_NOW:
             thread.join(LIMIT_S)
@@ -158,8 +158,8 @@ def test_the_first_ctrl_c_finishes_and_the_second_ends(
 def test_interrupts_close_together_are_one_ctrl_c(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("acquire.cli.interrupts.SAME_S", LIMIT_S)
     monkeypatch.setattr("acquire.cli.interrupts._presses", _Presses())
-    with interrupts_answered():
-        with first_interrupt_asks("finishing the segment") as asked:
+    with interrupts_handled():
+        with stop_on_interrupt("finishing the segment") as asked:
             signal.raise_signal(signal.SIGINT)
             signal.raise_signal(signal.SIGINT)
         signal.raise_signal(signal.SIGINT)  # the echo may come after the work has ended in good order

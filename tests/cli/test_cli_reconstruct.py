@@ -79,7 +79,7 @@ def test_several_voxels_side_by_side(cli: Cli, recording: Path, tmp_path: Path) 
     part = facts["segments"][0]
     assert part["processor_s"] > 0
     assert f"<td>{part['seconds']:.1f}</td><td>{part['processor_s']:.1f}</td>" in page
-    assert f"{facts['lines']} lines from {facts['first_line']} on" in page
+    assert f"{facts['lines']} lines starting with {facts['first_line']}" in page
 
 
 def test_a_plan_on_the_command_line(cli: Cli, recording: Path, tmp_path: Path) -> None:

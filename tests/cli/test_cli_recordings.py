@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from acquire.cli.recordings import CELL_CHARACTERS
+from acquire.cli.recording_page import CELL_CHARACTERS
 from acquire.clock import ClockFit
 from acquire.codes import PrbsCode
 from acquire.lines import ARMS, LineFlag, TaggedBlock
@@ -126,7 +126,7 @@ def test_ls_leaves_videos_out(cli: Cli, recording: Path) -> None:
 
 
 def test_ls_of_nothing(cli: Cli, tmp_path: Path) -> None:
-    assert cli("ls", tmp_path).out == f"no recordings in {tmp_path}\n"
+    assert cli("ls", tmp_path).out == f"there are no recordings in {tmp_path}\n"
     assert cli("ls", tmp_path, "--json").json == []
     assert cli("ls", tmp_path / "absent").code == 2
 
@@ -236,7 +236,7 @@ def test_recover_seals_what_its_writer_left(cli: Cli, tmp_path: Path) -> None:
 
 def test_info_states_what_can_be_lost(cli: Cli, recording: Path) -> None:
     assert (
-        "kill -9: at most 16 lines; power loss: what the system has not written back"
+        "kill -9: at most 16 lines; power loss: all that the system has not written to disk"
         in cli("info", recording).out
     )
 

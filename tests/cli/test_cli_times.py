@@ -101,11 +101,11 @@ def test_a_stretch_can_be_said_in_lines_and_in_times(
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        (("--first-line", "3", "--from", "9ms"), "said twice"),
-        (("--lines", "3", "--to", "9ms"), "said twice"),
-        (("--from", "9ms", "--to", "8ms"), "no line lies from 9ms to 8ms"),
+        (("--first-line", "3", "--from", "9ms"), "given twice"),
+        (("--lines", "3", "--to", "9ms"), "given twice"),
+        (("--from", "9ms", "--to", "8ms"), "there are no lines from 9ms to 8ms"),
         (("--from", "soon"), "the time 'soon' cannot be read"),
-        (("--from", "L2000", "--lines", "9"), "no line of"),
+        (("--from", "L2000", "--lines", "9"), "has no line at or after L2000"),
     ],
 )
 def test_what_is_no_stretch_is_refused(

@@ -129,7 +129,7 @@ def test_systemd_takes_the_unit(tmp_path: Path) -> None:
     read = subprocess.run(command, capture_output=True, text=True, timeout=300, check=False)
     assert (read.returncode, read.stderr) == (0, "")
     (tmp_path / "acquire.service").write_text("mine")
-    with pytest.raises(UsageError, match="is there, with another text"):
+    with pytest.raises(UsageError, match="exists with different contents"):
         install_service("rig-demo", directory=tmp_path)
 
 

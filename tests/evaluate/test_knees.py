@@ -47,12 +47,12 @@ def test_a_knee_is_where_doubling_the_time_stops_paying():
     [
         (
             run((1, 10), (15, 42), (30, 47), (60, 47.2)),
-            "admm, balanced: 30 s buy 47 dB; the next 30 s buy nothing",
+            "admm, balanced: 30 s give 47 dB; the next 30 s add nothing",
         ),
-        (run((1, 10), (15, 42), (40, 44)), "15 s buy 42 dB; the next 15 s buy nothing"),
-        (run((1, 10), (15, 42), (26, 44)), "15 s buy 42 dB; the rest, to 26 s, buys 2 more"),
-        (run((1, 10), (8, 42), (16, 48), ended="budget"), "cut by its budget after 16 s with 48 dB; "),
-        (run((1, 10), (8, 42), (16, 37)), "best after 8.0 s with 42 dB; going on to 16 s loses 5"),
+        (run((1, 10), (15, 42), (40, 44)), "15 s give 42 dB; the next 15 s add nothing"),
+        (run((1, 10), (15, 42), (26, 44)), "15 s give 42 dB; the rest, to 26 s, adds 2 dB"),
+        (run((1, 10), (8, 42), (16, 48), ended="budget"), "cut by its time limit after 16 s with 48 dB; "),
+        (run((1, 10), (8, 42), (16, 37)), "best after 8.0 s with 42 dB; continuing to 16 s loses 5 dB"),
     ],
 )
 def test_sentences_say_what_time_buys(made: Run, said: str):

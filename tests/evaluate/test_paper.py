@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from acquire.evaluate.paper.against import Row, captured, finer, frequency, same, sooner
 from acquire.evaluate.paper.bars import contrasts, last_resolved, place_of
+from acquire.evaluate.paper.comparison import Row, captured, faster, finer, frequency, same
 from acquire.sim.targets import usaf_picture
 
 GROUPS, FIELD_MM = (2, 3), 6.4
@@ -49,9 +49,9 @@ def test_words_hold_or_do_not_and_are_never_better(r: float, expected: bool, ver
 
 
 def test_times_and_frequencies_say_by_how_much() -> None:
-    assert sooner("time", "", "", 60.0, 600.0, "elsewhere").by == "× 10 faster, elsewhere"
-    assert sooner("time", "", "", 900.0, 600.0, "elsewhere").verdict == "worse"
-    assert frequency("x", "", "", 4999.5, 5000.0).by == "0.5 Hz off, 0.01%"
+    assert faster("time", "", "", 60.0, 600.0, "elsewhere").by == "× 10 faster, elsewhere"
+    assert faster("time", "", "", 900.0, 600.0, "elsewhere").verdict == "worse"
+    assert frequency("x", "", "", 4999.5, 5000.0).by == "error 0.5 Hz, 0.01%"
     assert frequency("x", "", "", 4900.0, 5000.0).verdict == "does not hold"
     assert same("video", "", "", equal=False).verdict == "worse"
     assert Row("accuracy", "–", "40 dB").verdict == "no number"

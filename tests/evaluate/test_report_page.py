@@ -102,13 +102,13 @@ def test_losses_stand_with_their_causes(page: Page) -> None:
 
 
 def test_how_busy_the_machine_was_is_told(page: Page) -> None:
-    assert "a thread that wanted a whole core got 63 % of it, 41 % at the least" in page.text
-    assert "The machine was busy: alone on it, this takes less time." in page.text
+    assert "a busy thread got 63 % of a core, and at worst 41 %" in page.text
+    assert "The machine was busy; on an idle machine, this takes less time." in page.text
 
 
 def test_a_solver_that_its_budget_stopped_is_not_shown_as_if_it_had_finished(page: Page) -> None:
-    assert "207 of 451 (stopped by its budget of 31.5 s)" in page.text
-    assert re.search(r"TwIST [\d.]+ dB, stopped by its budget", page.text)
+    assert "207 of 451 (stopped by its time limit of 31.5 s)" in page.text
+    assert re.search(r"TwIST [\d.]+ dB, stopped by its time limit", page.text)
     assert "118 of" not in page.text
 
 

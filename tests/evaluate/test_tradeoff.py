@@ -121,11 +121,11 @@ def test_page_and_table_say_the_same(judge, run, tmp_path):
     text = page.read_text()
     assert text.count("<picture>") == 2 * 6  # PSNR by two clocks, frames, SSIM, amplitude, frequency
     assert text.count('<figure class="player') == 2
-    assert "a thread that wanted a whole core got 100 % of it, 97 % at the least" in text
+    assert "a busy thread got 100 % of a core, and at worst 97 %" in text
     assert "The machine was busy" not in text
     assert "cut, 1 of 2" in text
-    assert f"The truth&#39;s own time mean, shown as a still, has {run.mean_db:.0f} dB" in text
-    assert "cut by its budget after" in text
+    assert f"The truth&#39;s mean over time, shown as a still, has {run.mean_db:.0f} dB" in text
+    assert "cut by its time limit after" in text
     assert f"{run.end.psnr_db:.1f}" in text
     with (tmp_path / "tradeoff.csv").open() as file:
         rows = list(csv.DictReader(file))

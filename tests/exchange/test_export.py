@@ -124,7 +124,7 @@ def test_the_error_that_a_video_tells_is_taken_along(cli: Cli, told: Path, tmp_p
 def test_a_file_without_a_place_for_the_error_is_told_of(cli: Cli, told: Path, tmp_path: Path) -> None:
     for name in ("v.mp4", "v.npy", "v.tif"):
         assert (
-            f"{name} has no place for the estimated error of regions"
+            f"{name} does not hold the estimated error of the regions"
             in cli("export", told, tmp_path / name)[2]
         )
     _, out, _ = cli("export", told, tmp_path / "w.mp4", "--json")
@@ -253,13 +253,13 @@ def test_times_choose_lines(cli: Cli, recording: Path, tmp_path: Path) -> None:
     ("words", "said"),
     [
         (["run", "l.xyz"], "possible: .tif (ImageJ)"),
-        (["run", "l.mp4"], "whose lines are no pictures"),
+        (["run", "l.mp4"], "whose lines are not pictures"),
         (["run", "l.npy", "--frames", 3], "a recording has no frames"),
         (["video", "v.npy", "--lines", 3], "a video has no lines"),
         (["video", "v.npy", "--average", 3], "a video has no lines"),
         (["run", "l.npy", "--lines", 300], "possible: lines 100 to 189"),
         (["run", "l.npy", "--lines", 0], "1 or more"),
-        (["run", "l.npy", "--lines", 5, "--to", "1ms"], "said twice"),
+        (["run", "l.npy", "--lines", 5, "--to", "1ms"], "given twice"),
         (["video", "v.npy", "--first-frame", 19, "--frames", 2], "possible: 0 to 19"),
         (["video", "v.mp4", "--fps", 0], "0.1 to 240"),
         (["video", "v.mp4", "--peak", -1], "above 0"),

@@ -34,7 +34,7 @@ def test_a_cut_numpy_file_is_refused_as_lines_and_as_code(tmp_path: Path, raw: b
 def test_what_is_no_row_of_real_numbers_holds_no_bits(tmp_path: Path, values: np.ndarray) -> None:
     path = tmp_path / "code.npy"
     np.save(path, values)
-    with pytest.raises(UsageError, match="holds no bits"):
+    with pytest.raises(UsageError, match="does not hold bits"):
         parse_code(f"bits:{path}")
 
 

@@ -149,7 +149,7 @@ def test_what_is_not_known_is_said(cli: Cli, lines: Any, tmp_path: Path) -> None
     assert facts["gap_list"] == [{"arm": "a", "first_line": 0, "count": LINES, "cause": "not_imported"}]
     assert len(facts["imported"]["unknown"]) == 7
     shown = cli("info", tmp_path / "b.zarr")[1]
-    assert "UTC not known" in shown
+    assert "UTC unknown" in shown
     assert f"from {files[1]}; not known: the trigger's tags" in " ".join(shown.split())
     assert verify(tmp_path / "b.zarr").intact
     segment = open_recording(tmp_path / "b.zarr").cut(0, LINES)
@@ -198,12 +198,12 @@ def test_lines_from_the_middle_of_a_run_have_its_code(
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        (["short.npy", "b.npy", *SIZES], "--lines 149 takes so many of each"),
+        (["short.npy", "b.npy", *SIZES], "--lines 149, to take this number of each"),
         (["a.npy", "b.npy", *SIZES, "--stages", 9], "lines of arm a have 8 pixels, with 9 stages"),
         (["a.npy", "b.npy", *SIZES[:-1], "bits:0xff00"], "the code has 16 bits, and 150 lines touch 315"),
         (["a.npy", "b.npy", *SIZES[:-1], "prbs:64"], "possible: prbs:DEGREE:SEED"),
-        (["a.npy", "b.npy", *SIZES[:-1], "bits:a.npy"], "holds no bits"),
-        (["a.npy", "b.npy", *SIZES[:4]], "cannot be read without --line-rate, --code"),
+        (["a.npy", "b.npy", *SIZES[:-1], "bits:a.npy"], "does not hold bits"),
+        (["a.npy", "b.npy", *SIZES[:4]], "cannot be imported without --line-rate, --code"),
         (["a.npy", *SIZES, "--line-rate", 0], "--line-rate 0 is out of range"),
         (["a.npy", *SIZES, "--substeps", 9], "--substeps 9 is out of range"),
         (["a.npy", *SIZES, "--lines", 999], "possible: 1 to 150"),
@@ -213,16 +213,16 @@ def test_lines_from_the_middle_of_a_run_have_its_code(
         (["a.npy", *SIZES, "--columns-a", "0:9"], "0:8 or a part of it"),
         (["float.npy", *SIZES], "float.npy holds float64"),
         (["flat.npy", *SIZES], "has the shape 150"),
-        (["three.npy", *SIZES], "(arm, line, pixel) of two arms"),
+        (["three.npy", *SIZES], "(arm, line, pixel) with two arms"),
         (["text.npy", *SIZES], "cannot be read as NumPy"),
         (["text.h5", *SIZES], "cannot be read as HDF5"),
         (["text.tif", *SIZES], "cannot be read as TIFF"),
         (["several.h5", *SIZES], "--dataset PATH"),
         (["several.h5", *SIZES, "--dataset", "/c"], "possible: /a, /b"),
         (["a.raw", *SIZES], "--dtype and --pixels"),
-        (["a.raw", *SIZES, "--dtype", "u16", "--pixels", 7], "are no whole number of lines"),
+        (["a.raw", *SIZES, "--dtype", "u16", "--pixels", 7], "are not a whole number of lines"),
         (["a.raw", *SIZES, "--dtype", "f4", "--pixels", 8], "possible: uint8"),
-        (["a.xyz", *SIZES], "does not say what it is"),
+        (["a.xyz", *SIZES], "cannot be taken from its name"),
         (["absent.npy", *SIZES], "No such file"),
         (["pipe.npy", *SIZES], "it is a pipe"),
         (["pipe.raw", *SIZES, "--dtype", "u16", "--pixels", 8], "it is a pipe"),

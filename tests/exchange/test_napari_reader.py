@@ -101,7 +101,7 @@ def test_no_more_is_read_than_is_looked_at(recording: Path, monkeypatch: pytest.
     stack = lazy.pages(open_recording(recording), "a")
     stack[7]
     assert read_rows == [70]
-    with pytest.raises(UsageError, match="9 pictures at once are 1080 bytes"):
+    with pytest.raises(UsageError, match="9 pictures at once would be 1080 bytes"):
         stack[:]
     assert read_rows == [70]
 

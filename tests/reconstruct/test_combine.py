@@ -264,7 +264,7 @@ def test_ctrl_c_keeps_the_best_so_far(recording_path, tmp_path):
     assert facts["state"] == "interrupted"
     assert facts["segments"][0]["iterations"] < 1_000_000
     assert facts["trusted"] == [0, 0]
-    assert b"Ctrl-C once more to end now" in error
+    assert b"press Ctrl-C again to end now" in error
     assert open_video(tmp_path / "v.zarr").attrs["provenance"]["state"] == "interrupted"
     assert [path.name for path in tmp_path.iterdir()] == ["v.zarr"]
 

@@ -113,7 +113,7 @@ def test_dark_flat_target_by_hand(bench: tuple[Daemon, Callable[[str], None]], t
         said += line
         if "Put a target in" in line:
             put(target())
-        if "Enter goes on" in line:
+        if "press Enter" in line:
             guided.stdin.write("\n")
             guided.stdin.flush()
     out = guided.communicate(timeout=300)[0]
@@ -167,7 +167,7 @@ def test_what_goes_wrong_leaves_the_instrument_as_it_was(
         assert client.status().calibration.path == tmp_path / "cal.zarr"
         client.start(tmp_path / "bare.zarr", lines=64)
         client.wait(SEALED, timeout_s=120)
-        assert "which the rig named, was not there" in daemon("info", "bare.zarr").out
+        assert "named in the rig file, did not exist" in daemon("info", "bare.zarr").out
         answer = daemon("calibrate", "all", "--only", "flat", "--yes", "--lines", 64, "--out", cal)
         assert answer.code == 2
         assert "offsets of the columns first" in answer.err

@@ -126,5 +126,5 @@ def test_a_directory_that_exists_is_refused_and_untouched(demo: tuple[Path, dict
         check=False,
     )
     assert again.returncode == 2
-    assert "exists and stays untouched" in again.stderr
+    assert "exists and is not overwritten" in again.stderr
     assert sorted((path, path.stat().st_mtime_ns) for path in out.rglob("*")) == before

@@ -68,7 +68,10 @@ def test_commands_cope_with_lines_that_are_wider_than_the_sensor_has_stages(
     recorded: Path, tmp_path: Path
 ) -> None:
     told = " ".join(acquire("info", recorded).out.split())  # lines are as long as the terminal is wide
-    assert "32 x 48 fine pixels behind a fibre, 2 x 3 tiles of 16 x 16; 2 and 3 bands on a and b" in told
+    assert (
+        "32 x 48 fine pixels behind a fibre, 2 x 3 tiles of 16 x 16; 2 and 3 fibre bands on arms a and b"
+        in told
+    )
     assert acquire("verify", recorded).code == 0
     assert open_recording(recorded).overview("a").rows.shape[1] == 53
     answer = acquire("cut", recorded, "--tile", "1,2", "--lines", 40, "--out", tmp_path / "t.npz")
@@ -83,7 +86,7 @@ def test_commands_cope_with_lines_that_are_wider_than_the_sensor_has_stages(
     for words, reason in (
         ((), "shows 6 tiles of a scene behind a fibre; none was named"),
         (("--tile", "2,0"), "no tile 2,0; possible: ROW,COLUMN from 0,0 to 1,2".replace("; ", "\n  ")),
-        (("--tile", "0-1,0"), "takes one tile, and 0-1,0 is 2"),
+        (("--tile", "0-1,0"), "takes one tile, but 0-1,0 selects 2"),
         (("--tile", "x"), "tiles 'x' cannot be read"),
     ):
         answer = acquire("cut", recorded, *words, "--lines", 40, "--out", tmp_path / "no.npz")

@@ -82,7 +82,7 @@ def test_the_document_is_carried_out(tmp_path: Path) -> None:
         check=False,
     )
     assert done.returncode == 0, done.stdout + done.stderr
-    for told in ("self test passed", "turn 90", "DN per electron", "250 ms lit, 250 ms dark"):
+    for told in ("the self-test passed", "turn 90", "DN per electron", "250 ms lit, 250 ms dark"):
         assert told in done.stdout, told
     known = open_calibration(tmp_path / "cal.zarr")
     assert list(known.steps) == ["delay", "dark", "linearity", "transfer", "flat", "orientation", "align"]

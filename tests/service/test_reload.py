@@ -67,7 +67,7 @@ def test_what_may_change_does_and_the_recording_goes_on(daemon: Daemon, tmp_path
         assert "hooks.on = ['fault', 'verdict'] at once; it was ['fault', 'loss', 'disk']" in answer.out
         assert client.setup().changed["recording.reserve_gb"] == 0.5
         until(lambda: (disk := client.status().disk) is not None and disk.reserve_bytes == 500_000_000)
-        assert daemon("reload").out == f"{daemon.config} says what it said before\n"
+        assert daemon("reload").out == f"{daemon.config} has not changed\n"
         client.stop()
         client.start(tmp_path / "second.zarr", duration_s=0.2)
         client.wait({State.ARMED}, 60)

@@ -147,7 +147,7 @@ def test_a_recovered_recording_is_replayed_with_what_it_has_left(tmp_path: Path)
     refused = acquire("replay", path, "--out", tmp_path / "none.zarr")
     assert (
         refused.code,
-        f"try: acquire stop where it is being written, or acquire recover {path}" in refused.err,
+        f"try: acquire stop, if it is being written, or acquire recover {path}" in refused.err,
     ) == (
         2,
         True,

@@ -129,7 +129,7 @@ def test_a_server_goes_away_and_comes_back_and_nobody_waits(lab: Lab, tmp_path: 
     until(lambda: upload(daemon).state == "copied")
     assert upload(daemon).error == ""
     lines = open_recording(path).lines
-    assert f"x.zarr copied, {lines} lines there" in daemon("status").out
+    assert f"x.zarr copied, {lines} lines copied" in daemon("status").out
     check_copy(lab.download(tmp_path / "far") / "x.zarr", path)
     assert daemon.end() == 0
 

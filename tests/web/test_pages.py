@@ -21,7 +21,7 @@ from PIL import Image
 from acquire.evaluate import tradeoff_page
 from acquire.evaluate.host import Busyness
 from acquire.evaluate.paper import page as paper_page
-from acquire.evaluate.paper.against import Row, captured, finer, same, sooner, words
+from acquire.evaluate.paper.comparison import Row, captured, faster, finer, same, statement
 from acquire.evaluate.paper.drawing import strip
 from acquire.evaluate.paper.studio import PaperFigure, Picture, Studio
 from acquire.evaluate.rendering import Look, Panel, render
@@ -137,11 +137,11 @@ def paper(directory: Path) -> Path:
     rows = (
         finer("resolves", "group 3, element 5", "group 3, element 6", 1),
         same("video", "64 × 64 × 598", "64 × 64 × 598", equal=True),
-        sooner("time", "“ten more minutes”", "900 s", 900.0, 600.0, "on another processor"),
+        faster("time", "“ten more minutes”", "900 s", 900.0, 600.0, "on another processor"),
         captured(
             "300 kHz pulses, intra-line; true picture, camera noise", "captured with high fidelity", 0.98
         ),
-        words("bars", "#B significantly better", "none", "#B 1 element coarser", hold=False),
+        statement("bars", "#B significantly better", "none", "#B 1 element coarser", hold=False),
         Row("accuracy", "–", "39.8 dB, SSIM 0.98 in 33.3 s"),
     )
     figure = PaperFigure(
@@ -309,15 +309,13 @@ def test_on_paper_it_is_light_and_whole(opened: Callable[..., Page]) -> None:
 @pytest.mark.parametrize("place", ["demo", "paper", "tradeoff"], indirect=True)
 def test_the_page_says_how_busy_the_machine_was(opened: Callable[..., Page], place: str) -> None:
     share = 63 if "/demo" in place else 55
-    assert f"a thread that wanted a whole core got {share} % of it" in opened().inner_text("main")
+    assert f"a busy thread got {share} % of a core" in opened().inner_text("main")
 
 
 @pytest.mark.parametrize("place", ["paper"], indirect=True)
 def test_reached_is_not_better(opened: Callable[..., Page]) -> None:
     page = opened()
-    cells = [
-        each.inner_text().split("\n") for each in page.locator("#fig9 td[data-label='against it']").all()
-    ]
+    cells = [each.inner_text().split("\n") for each in page.locator("#fig9 td[data-label='verdict']").all()]
     assert cells == [
         ["▲ better", "1 element finer, × 1.12"],
         ["= equal"],

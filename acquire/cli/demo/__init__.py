@@ -1,4 +1,4 @@
-"""``acquire demo``: the whole instrument on a simulated rig, from arming to a report."""
+"""``acquire demo``: run the whole instrument on a simulated rig, from arming to a report."""
 
 from __future__ import annotations
 
@@ -31,15 +31,21 @@ def register(app: typer.Typer) -> None:
 def demo(
     out: Annotated[
         Path | None,
-        typer.Option(metavar="DIR", help="New directory for everything; else acquire-demo, -2, …"),
+        typer.Option(
+            metavar="DIR",
+            help="New directory for all results. Default: acquire-demo, acquire-demo-2 and so on.",
+        ),
     ] = None,
     seed: Annotated[int, typer.Option(min=0, help="Seed of the exposure code.")] = SEED,
-    lines: Annotated[int, typer.Option(help="Number of lines that are recorded.")] = LINES,
+    lines: Annotated[int, typer.Option(help="Number of lines to record.")] = LINES,
     budget: Annotated[
-        float | None, typer.Option(parser=seconds, metavar="TIME", help="Wall time of the default solver.")
+        float | None,
+        typer.Option(
+            parser=seconds, metavar="TIME", help="Time limit for the default solver. Default: no limit."
+        ),
     ] = None,
     twist_budget: Annotated[
-        float, typer.Option(parser=seconds, metavar="TIME", help="Wall time of the paper's solver.")
+        float, typer.Option(parser=seconds, metavar="TIME", help="Time limit for the paper's solver, TwIST.")
     ] = TWIST_BUDGET_S,
     config: Annotated[
         str,
@@ -48,30 +54,31 @@ def demo(
             "-c",
             metavar="FILE",
             autocompletion=rigs,
-            help="Rig file, or the name of a built-in one.",
+            help="Rig file, or the name of a built-in rig.",
         ),
     ] = RIG,
     trigger: Annotated[
         Literal["simulated", "rtl"],
-        typer.Option(help="A model of the sync trigger, or its gateware itself, clock by clock."),
+        typer.Option(help="Sync trigger: a model of it, or its gateware, simulated clock by clock (rtl)."),
     ] = "simulated",
     cameras: Annotated[
         Literal["simulated", "gentl", "gige"],
-        typer.Option(help="Cameras in the grabbers, or behind a GenTL producer or GigE Vision."),
+        typer.Option(help="Simulated cameras: built in, behind a GenTL producer, or over GigE Vision."),
     ] = "simulated",
     json: JsonFlag = False,
 ) -> None:
     """Record Scene #1 of the paper with a simulated rig, reconstruct it, and write a report.
 
-    A real daemon is started, armed, and records; nothing is left running.
+    The command starts, arms and records with a real daemon, and stops it again afterwards.
 
     Example: [bold]acquire demo --out /tmp/demo --seed 7[/]
     """
     from acquire.config import load_rig
 
     config = rig_of(config, cameras)
+    names = (Path(f"acquire-demo-{n}" if n > 1 else "acquire-demo") for n in itertools.count(1))
     plan = DemoPlan(
-        out=out or _free(Path("acquire-demo")),
+        out=out or next(name for name in names if not name.exists()),
         config=config,
         seed=seed,
         lines=lines,
@@ -100,33 +107,26 @@ def demo(
     print_facts(_headline(page, summarise(result)))
 
 
-def _free(path: Path) -> Path:
-    """``path``, or with the first number behind it that is free."""
-    names = (path if n == 1 else path.with_name(f"{path.name}-{n}") for n in itertools.count(1))
-    return next(name for name in names if not name.exists())
-
-
 def _headline(page: Path, summary: dict[str, Any]) -> dict[str, Any]:
     capture, best = summary["capture"], summary["solvers"][0]
     arms = capture["arms"]
+    solvers = {}
+    for facts in summary["solvers"]:
+        text = f"{facts['psnr_db']} dB, SSIM {facts['ssim']}, {facts['seconds']} s"
+        if facts["stopped_by_budget_s"] is not None:
+            text += (
+                f", {facts['iterations']} of {facts['requested_iterations']} iterations "
+                f"(stopped by its time limit of {facts['stopped_by_budget_s']:g} s)"
+            )
+        solvers[facts["label"]] = text
     return {
         "lines": ", ".join(
             f"{arm} {facts['recorded']} recorded, {facts['missing']} missing" for arm, facts in arms.items()
         ),
         "recording": f"{capture['recording']}, {capture['size_mb']} MB, {capture['condition']}",
-        **{solver["label"]: _solver(solver) for solver in summary["solvers"]},
+        **solvers,
         "frequencies": ", ".join(
             f"{curve['name']} {curve['measured_hz']} Hz" for curve in best["curves"] if curve["measured_hz"]
         ),
         "report": page,
     }
-
-
-def _solver(facts: dict[str, Any]) -> str:
-    text = f"{facts['psnr_db']} dB, SSIM {facts['ssim']}, {facts['seconds']} s"
-    if facts["stopped_by_budget_s"] is None:
-        return text
-    return (
-        f"{text}, {facts['iterations']} of {facts['requested_iterations']} iterations "
-        f"(stopped by its budget of {facts['stopped_by_budget_s']:g} s)"
-    )

@@ -1,9 +1,8 @@
-"""The demo's second half: cut, reconstruct by both solvers, compare with the truth."""
+"""The demo's second half: cut the lines, reconstruct them with both solvers, compare with the truth."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import partial
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
@@ -19,7 +18,6 @@ from acquire.evaluate.report import (
     DemoResult,
     Region,
     RigFacts,
-    SolverResult,
     evaluate_solver,
 )
 from acquire.recon import Reconstruction, reconstruct
@@ -32,8 +30,6 @@ from acquire.store import Recording, open_recording, write_video
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from numpy.typing import NDArray
-
     from acquire.cli.demo.capture import Captured
     from acquire.cli.demo.plan import DemoPlan
     from acquire.cli.journal import Journal
@@ -41,14 +37,14 @@ if TYPE_CHECKING:
     from acquire.lines import Segment
 
 INNER = 0.9
-"""Regions hold the voxels that a shape covers at least so far: edges mix light and dark."""
-SAID_S = 1.0
-"""Compiling shorter than this explains nothing: the solver's own time is beside the stage's."""
+"""Share of a voxel that a shape must cover to be in its region: voxels on edges mix light and dark."""
+REPORTED_S = 1.0
+"""A shorter compilation is not mentioned: it does not explain why a step took longer than its solver."""
 
 
 @dataclass(frozen=True, slots=True)
 class Method:
-    """A solver of the demo: its name for people, its video's, and its time."""
+    """A solver of the demo: its name, its label, the file of its video, and its time limit."""
 
     solver: Literal["admm", "twist"]
     label: str
@@ -57,13 +53,19 @@ class Method:
 
 
 def analyse(plan: DemoPlan, captured: Captured, rig: RigConfig, journal: Journal) -> DemoResult:
-    """Everything that the report shows; leaves truth and videos in ``plan.out``."""
+    """Return everything that the report shows; write the truth and the videos to ``plan.out``."""
     recording = open_recording(captured.path)
     with journal.stage("Cut both arms") as note:
         first = recording.first_line + segment_row(rig)
         note["detail"] = f"lines {first} to {first + SEGMENT_LINES - 1}"
         segment = recording.cut(first, SEGMENT_LINES)
-    scene = _scene(recording, segment)
+    # the scene as the recording describes it, not as this process remembers it
+    scene = build_scene(
+        LedSceneConfig.model_validate(recording.attrs["scene"]),
+        segment.geometry.size,
+        segment.substep_ns * 1e-9,
+    )
+    assert isinstance(scene, LedScene)
     with journal.stage("Save the truth at full resolution"):
         _save_truth(plan.out / "truth.zarr", scene, segment)
     methods = (
@@ -82,8 +84,20 @@ def analyse(plan: DemoPlan, captured: Captured, rig: RigConfig, journal: Journal
     with journal.stage("Compare with the truth"):
         voxels = truth(scene, _first_substep(segment), segment.geometry.span, N_M, T_M)[trusted]
         regions = _regions(scene, segment, trusted)
-        interval_s = segment.substep_ns * T_M * 1e-9
-        solvers = tuple(map(partial(_judge, voxels, regions, interval_s), methods, videos))
+        solvers = tuple(
+            evaluate_solver(
+                method.label,
+                video.video[trusted],
+                voxels,
+                regions,
+                segment.substep_ns * T_M * 1e-9,
+                seconds=video.seconds,
+                iterations=video.iterations,
+                requested_iterations=video.iterations_asked,
+                budget_s=method.budget_s,
+            )
+            for method, video in zip(methods, videos, strict=True)
+        )
     return DemoResult(
         title=str(recording.attrs["scene"]["title"]),
         when=journal.when,
@@ -112,40 +126,14 @@ def _solve(method: Method, segment: Segment, journal: Journal) -> Reconstruction
             budget_s=method.budget_s,
             progress=lambda step: advance(step.iteration, step.iterations),
             solver=method.solver,
-            refuse=False,  # the recording is made: something is shown of it
+            refuse=False,  # the report shows a poor result rather than none
         )
         note["detail"] = f"{result.iterations} iterations"
-        if result.compiled_s >= SAID_S:
-            note["detail"] += f"; for {result.compiled_s:.1f} s of these compiled, once after an installation"
+        if result.compiled_s >= REPORTED_S:
+            note["detail"] += (
+                f", including {result.compiled_s:.1f} s of compilation, needed once per installation"
+            )
     return result
-
-
-def _judge(
-    voxels: NDArray[np.float32],
-    regions: tuple[Region, ...],
-    interval_s: float,
-    method: Method,
-    result: Reconstruction,
-) -> SolverResult:
-    return evaluate_solver(
-        method.label,
-        result.video[result.trusted],
-        voxels,
-        regions,
-        interval_s,
-        seconds=result.seconds,
-        iterations=result.iterations,
-        requested_iterations=result.iterations_asked,
-        budget_s=method.budget_s,
-    )
-
-
-def _scene(recording: Recording, segment: Segment) -> LedScene:
-    """The scene as the recording describes it, not as this process remembers it."""
-    config = LedSceneConfig.model_validate(recording.attrs["scene"])
-    scene = build_scene(config, segment.geometry.size, segment.substep_ns * 1e-9)
-    assert isinstance(scene, LedScene)
-    return scene
 
 
 def _first_substep(segment: Segment) -> int:
@@ -153,7 +141,7 @@ def _first_substep(segment: Segment) -> int:
 
 
 def _save_truth(path: Path, scene: LedScene, segment: Segment) -> None:
-    """What the lines of the segment saw: every sub-step at full resolution."""
+    """Write the scene during the segment: every sub-step at full resolution."""
     frames = scene.frames(_first_substep(segment), segment.geometry.span)
     provenance = {"first_substep": _first_substep(segment), "first_line": segment.first_line}
     write_video(
@@ -168,7 +156,7 @@ def _save_truth(path: Path, scene: LedScene, segment: Segment) -> None:
 
 
 def _regions(scene: LedScene, segment: Segment, trusted: slice) -> tuple[Region, ...]:
-    """One region per LED that fills a voxel; theory is its light in the voxels wholly behind its mask."""
+    """Return one region per LED that fills a voxel, with its theoretical light in the voxels it covers."""
     first = _first_substep(segment) + trusted.start
     light = scene.intensity(first, trusted.stop - trusted.start)
     side = scene.size // N_M

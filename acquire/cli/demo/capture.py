@@ -1,4 +1,4 @@
-"""The demo's recording: a daemon of its own, driven through its socket as any client would."""
+"""The demo's recording: a daemon of its own, controlled through its socket like by any client."""
 
 from __future__ import annotations
 
@@ -29,13 +29,13 @@ LOG = "daemon.log"
 START_TIMEOUT_S = 60.0
 END_TIMEOUT_S = 30.0
 STALL_TIMEOUT_S = 30.0
-"""The recording is given up when no line was added for so long."""
+"""The recording is abandoned if no line was added for this time."""
 POLL_S = 0.05
 
 
 @dataclass(frozen=True, slots=True)
 class Captured:
-    """The recording and the daemon's last word on it."""
+    """The recording, the daemon's last status and the duration of the capture."""
 
     path: Path
     status: Status
@@ -44,7 +44,7 @@ class Captured:
 
 def record(plan: DemoPlan, journal: Journal) -> Captured:
     """Start a daemon, arm, record, and end the daemon again; its log goes to daemon.log."""
-    log = plan.out / LOG
+    log, path = plan.out / LOG, plan.out / "recording.zarr"
     with tempfile.TemporaryDirectory(prefix="acquire-") as directory:  # socket paths must be short
         socket = Path(directory) / "acquire.sock"
         with daemon(plan, socket) as process, Client(socket) as client:
@@ -52,9 +52,20 @@ def record(plan: DemoPlan, journal: Journal) -> Captured:
                 await_daemon(client, process, log)
                 note["detail"] = f"process {process.pid}"
             with journal.stage("Arm trigger and cameras"):
-                client.arm(force=True)  # simulated cameras wait for a host that is busy
+                client.arm(force=True)  # even on a slow host: simulated cameras wait for it
             with journal.stage("Record") as note:
-                captured = _record(client, plan.out / "recording.zarr", plan.lines)
+                started = time.perf_counter()
+                client.start(path, lines=plan.lines)
+                with stage_progress("recording") as advance:
+                    status = follow(client, plan.lines, advance)
+                if status.last is None or status.last.condition != "GOOD":
+                    reason = status.fault or (
+                        status.last and f"{status.last.condition}: {status.last.end_reason}"
+                    )
+                    raise DataError(
+                        f"the recording {path} is not complete: {reason}", hint=f"acquire info {path}"
+                    )
+                captured = Captured(path, status, time.perf_counter() - started)
                 note["detail"] = f"{plan.lines} lines of both arms"
             with journal.stage("End the daemon"):
                 if not end(process):
@@ -63,7 +74,7 @@ def record(plan: DemoPlan, journal: Journal) -> Captured:
 
 
 def compile_gateware(rig: RigConfig, journal: Journal) -> None:
-    """So that arming need not wait for it; says how time will pass."""
+    """Compile the gateware before arming, which would otherwise wait for it, and report the clock rate."""
     from acquire.sim import rtl
 
     timing = rig.trigger
@@ -72,13 +83,13 @@ def compile_gateware(rig: RigConfig, journal: Journal) -> None:
         substep_us = 1e6 * timing.substep_ticks / timing.clock_hz
         note["detail"] = (
             f"{timing.substep_ticks} clocks per sub-step of {substep_us:g} us; "
-            "it records as fast as they can be computed"
+            "recording runs as fast as the simulation computes them"
         )
 
 
 @contextmanager
 def daemon(plan: DemoPlan, socket: Path) -> Iterator[subprocess.Popen[bytes]]:
-    """``acquire serve`` for the demonstration."""
+    """Run ``acquire serve`` for the demo."""
     settings = {"code.seed": plan.seed, **trigger_settings(plan)}
     options = [f"--config={plan.config}", f"--socket={socket}"]
     options += [f"--set={key}={value!r}" for key, value in settings.items()]
@@ -88,11 +99,11 @@ def daemon(plan: DemoPlan, socket: Path) -> Iterator[subprocess.Popen[bytes]]:
 
 @contextmanager
 def daemon_process(options: list[str], log: Path) -> Iterator[subprocess.Popen[bytes]]:
-    """``acquire serve`` as a process of its own, which ends with the block, however that ends."""
+    """Run ``acquire serve`` in a process of its own, which is ended with the block in any case."""
     command = [sys.executable, "-m", "acquire", "serve", "--owned", *options]
     with (
         log.open("wb") as file,
-        subprocess.Popen(  # noqa: S603  # ourselves
+        subprocess.Popen(  # noqa: S603  # the command is our own program
             command, stdin=subprocess.PIPE, stderr=file, stdout=file
         ) as process,
     ):
@@ -103,7 +114,7 @@ def daemon_process(options: list[str], log: Path) -> Iterator[subprocess.Popen[b
 
 
 def end(process: subprocess.Popen[bytes], timeout_s: float = END_TIMEOUT_S) -> bool:
-    """Let the daemon seal what it records, but not for ever; False when it had to be killed."""
+    """Ask the daemon to seal its recording and end. Return False if it took too long and was killed."""
     process.terminate()
     try:
         process.wait(timeout_s)
@@ -115,7 +126,7 @@ def end(process: subprocess.Popen[bytes], timeout_s: float = END_TIMEOUT_S) -> b
 
 
 def await_daemon(client: Client, process: subprocess.Popen[bytes], log: Path) -> None:
-    """Return once the daemon answers; AcquireError with its last words when it ended instead."""
+    """Wait until the daemon answers. Raises AcquireError with the end of its log if it ended instead."""
     deadline = time.monotonic() + START_TIMEOUT_S
     while True:
         try:
@@ -131,26 +142,15 @@ def await_daemon(client: Client, process: subprocess.Popen[bytes], log: Path) ->
             return
 
 
-def _record(client: Client, path: Path, lines: int) -> Captured:
-    started = time.perf_counter()
-    client.start(path, lines=lines)
-    with stage_progress("recording") as advance:
-        status = follow(client, lines, advance)
-    if status.last is None or status.last.condition != "GOOD":
-        reason = status.fault or (status.last and f"{status.last.condition}: {status.last.end_reason}")
-        raise DataError(f"the recording {path} is not whole: {reason}", hint=f"acquire info {path}")
-    return Captured(path, status, time.perf_counter() - started)
-
-
 def follow(client: Client, lines: int, advance: Callable[[int, int], None]) -> Status:
-    """Poll until the recording is sealed; give up when nothing moves."""
-    seen, moved = -1, time.monotonic()
+    """Poll until the recording is sealed. Raises DataError if no line is added for `STALL_TIMEOUT_S`."""
+    latest, grew_s = -1, time.monotonic()
     while (status := client.status()).state not in SEALED | {State.FAULTED}:
         now = status.recording.recorded_lines if status.recording else lines
         advance(now, lines)
-        if now != seen:
-            seen, moved = now, time.monotonic()
-        elif time.monotonic() - moved > STALL_TIMEOUT_S:
+        if now != latest:
+            latest, grew_s = now, time.monotonic()
+        elif time.monotonic() - grew_s > STALL_TIMEOUT_S:
             raise DataError(f"no line was recorded for {STALL_TIMEOUT_S:g} s", hint="acquire status")
         time.sleep(POLL_S)
     return status

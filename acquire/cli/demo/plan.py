@@ -1,4 +1,4 @@
-"""What a demonstration is to do, and whether it can: everything is refused before anything is touched."""
+"""The plan of a demo run and its checks: an impossible run is refused before any file is created."""
 
 from __future__ import annotations
 
@@ -19,29 +19,30 @@ LINES = 33_334
 TWIST_BUDGET_S = 30.0
 
 SEGMENT_LINES = 263
-"""L_R of Fig. 9: 598 trusted frames."""
+"""L_R in Fig. 9, which gives 598 trusted frames."""
 
 SEGMENT_START_S = 0.052
-"""Where Fig. 9 cuts, from the start of the recording."""
+"""Start of the lines used in Fig. 9, after the start of the recording."""
 
 N_M, T_M = 3, 1
-"""Fig. 9: 64 × 64 voxels at the sub-step rate."""
+"""As in Fig. 9: 64 × 64 voxels at the sub-step rate."""
 
 LEAST_SIDE = 11
-"""Voxels: the window of SSIM."""
+"""Minimum side of a frame in voxels: the size of the SSIM window."""
 
 LEAST_FRAMES = 8
-"""What the fit of a sinusoid with its harmonics takes."""
+"""Minimum number of frames for the fit of a sinusoid with its harmonics."""
 
 RTL_TICKS = 60
-"""Clocks of a sub-step where the trigger is its gateware; and the lowest clock that a rig can have."""
+"""Clocks per sub-step if the trigger's gateware is simulated."""
 
 RTL_LEAST_HZ = 1_000_000
+"""The lowest clock frequency that a rig may have."""
 
 
 @dataclass(frozen=True, slots=True)
 class DemoPlan:
-    """One run: a new directory for everything, the rig, its code's seed, lines, seconds for the solvers."""
+    """One demo run: output directory, rig, seed of the code, lines, time limits of the solvers, trigger."""
 
     out: Path
     config: str = RIG
@@ -53,7 +54,7 @@ class DemoPlan:
 
     @property
     def command(self) -> str:
-        """The words that do the same again, somewhere else."""
+        """Command line that repeats the run in another directory."""
         words = ["acquire", "demo", "--seed", str(self.seed), "--lines", str(self.lines)]
         if self.config != RIG:
             words += ["--config", self.config]
@@ -67,9 +68,10 @@ class DemoPlan:
 
 
 def trigger_settings(plan: DemoPlan) -> dict[str, str | int]:
-    """What the demonstration changes in its rig file, as `load_rig` takes it.
+    """Return the changes of the demo to its rig file, for `load_rig`.
 
-    The gateware is computed clock by clock: it gets a slower clock, with few clocks in the same sub-step.
+    The gateware is simulated clock by clock, so it gets a slower clock with fewer clocks per sub-step; the
+    duration of a sub-step stays the same.
     """
     if plan.trigger == "simulated":
         return {}
@@ -83,51 +85,43 @@ def trigger_settings(plan: DemoPlan) -> dict[str, str | int]:
 
 
 def rig_of(config: str, cameras: str) -> str:
-    """The rig file for the cameras that were asked for. Raises UsageError for a file of the user's own."""
+    """Return the rig file for the requested cameras. Raises UsageError for a file of the user's own."""
     if cameras == "simulated" or config == CAMERA_RIGS[cameras]:
         return config
     if config != RIG:
         raise UsageError(
-            f"the demo cannot give {config} the cameras {cameras!r}: they are those of its file",
-            hint="cameras.a.driver in that file, or no --config",
+            f"the demo cannot use {cameras!r} cameras with {config}, which has cameras of its own",
+            hint="cameras.a.driver in that file, or leave out --config",
         )
     return CAMERA_RIGS[cameras]
 
 
 def check(plan: DemoPlan, rig: RigConfig) -> None:
-    """Raise UsageError for what could not be carried out to the end."""
+    """Raise UsageError for a run that could not be completed."""
     from acquire.config import check_directory
 
     out = plan.out
     if out.exists():
-        raise UsageError(f"demo to {out}: it exists and stays untouched", hint="--out with a new directory")
+        raise UsageError(
+            f"the demo cannot be written to {out}, which exists and is not overwritten",
+            hint="--out with a new directory",
+        )
     if not out.absolute().parent.is_dir():
-        raise UsageError(f"demo to {out}: there is no directory {out.absolute().parent}")
+        raise UsageError(
+            f"the demo cannot be written to {out}: there is no directory {out.absolute().parent}"
+        )
     for budget_s in (plan.budget_s, plan.twist_budget_s):
         if budget_s is not None and not budget_s > 0:
             raise UsageError(f"a budget of {budget_s} s is out of range", possible="more than 0")
     _check_rig(plan, rig)
     check_directory(rig)
+    # Simulators that have to be compiled, and libraries that may not be installed, are tried before anything
+    # is written.
+    drivers = (rig.cameras.a.driver, rig.cameras.b.driver)
     if rig.trigger.driver == "rtl":
         from acquire.sim.rtl import demand
 
         demand()
-    _check_cameras(rig)
-    least = segment_row(rig) + SEGMENT_LINES
-    if plan.lines < least:
-        raise UsageError(
-            f"the demo cannot be made of {plan.lines} lines",
-            possible=f"{least} or more: it cuts {SEGMENT_LINES} at 52 ms",
-        )
-
-
-def segment_row(rig: RigConfig) -> int:
-    """Row of the recording at which the segment begins."""
-    return round(SEGMENT_START_S * rig.line_rate_hz)
-
-
-def _check_cameras(rig: RigConfig) -> None:
-    drivers = (rig.cameras.a.driver, rig.cameras.b.driver)
     if "gentl-simulated" in drivers:
         from acquire.sim.gentl.build import build
 
@@ -136,26 +130,37 @@ def _check_cameras(rig: RigConfig) -> None:
         from acquire.camera.aravis import load
 
         load()
+    least = segment_row(rig) + SEGMENT_LINES
+    if plan.lines < least:
+        raise UsageError(
+            f"the demo cannot be made with {plan.lines} lines",
+            possible=f"{least} or more: it uses {SEGMENT_LINES} lines from 52 ms on",
+        )
+
+
+def segment_row(rig: RigConfig) -> int:
+    """Return the row of the recording at which the segment begins."""
+    return round(SEGMENT_START_S * rig.line_rate_hz)
 
 
 def _check_rig(plan: DemoPlan, rig: RigConfig) -> None:
     if rig.trigger.driver not in ("simulated", "rtl"):
         raise UsageError(
-            f"demo cannot use trigger driver {rig.trigger.driver!r}", possible="'simulated', 'rtl'"
+            f"the demo cannot use the trigger driver {rig.trigger.driver!r}", possible="'simulated', 'rtl'"
         )
     if rig.code.kind != "prbs":
         raise UsageError(
-            f"demo cannot use {plan.config} with code.kind = {rig.code.kind!r}", possible="'prbs'"
+            f"the demo cannot use {plan.config} with code.kind = {rig.code.kind!r}", possible="'prbs'"
         )
     geometry = rig.geometry.segment(SEGMENT_LINES)
     if geometry.size % N_M or geometry.size < N_M * LEAST_SIDE:
         raise UsageError(
             f"the demo cannot use {plan.config}, whose n = M·S is {geometry.size}",
-            possible=f"a multiple of {N_M}, {N_M * LEAST_SIDE} or more",
+            possible=f"a multiple of {N_M}, at least {N_M * LEAST_SIDE}",
         )
     if (frames := geometry.trusted.stop - geometry.trusted.start) < LEAST_FRAMES:
         raise UsageError(
-            f"demo of {plan.config}: of {SEGMENT_LINES} lines with M = {geometry.stages} stages, "
-            f"{frames} frames can be trusted",
-            possible=f"fewer stages: {LEAST_FRAMES} trusted frames or more",
+            f"the demo cannot use {plan.config}: {SEGMENT_LINES} lines with M = {geometry.stages} stages "
+            f"have {frames} trusted frames",
+            possible=f"fewer stages, for {LEAST_FRAMES} trusted frames or more",
         )

@@ -19,10 +19,10 @@ THRESHOLD = 0.1
 
 
 def contrasts(picture: NDArray[Any], field_mm: float, groups: tuple[int, ...]) -> dict[str, float]:
-    """(bright − dark)/(bright + dark) of each element, ``"group/element"``, the worse of both directions.
+    """Return (bright − dark)/(bright + dark) of each element ``"group/element"``, for the worse direction.
 
-    Bright is the mean along the middle of the bars, dark that between them, at the profile's own extremes:
-    the brightest line of a bar's width, the darkest of a gap's.
+    Bright is the mean along the middle of the bars, at the centre of each bar's width; dark is the same at
+    the centre of each gap.
     """
     found: dict[str, float] = {}
     bars = [bar for bar in usaf_bars(groups) if bar.element > 0]
@@ -35,7 +35,7 @@ def contrasts(picture: NDArray[Any], field_mm: float, groups: tuple[int, ...]) -
 
 
 def last_resolved(contrast: dict[str, float]) -> str:
-    """The finest element up to which all reach `THRESHOLD`; ``–`` when the first does not."""
+    """Return the finest element up to which all reach `THRESHOLD`; ``–`` if the first does not."""
     last = "–"
     for name, value in sorted(contrast.items()):
         if value < THRESHOLD:
@@ -45,7 +45,7 @@ def last_resolved(contrast: dict[str, float]) -> str:
 
 
 def place_of(element: str) -> int:
-    """Elements up to this one, counted through the groups; one before the first of group 2 for ``–``."""
+    """Number an element through the groups; ``–`` comes right before the first element of group 2."""
     group, _, number = element.partition("/")
     return 6 * int(group) + int(number) if number else 6 * 2
 
@@ -71,6 +71,6 @@ def _pixel(millimetres: float, field_mm: float, size: int) -> float:
 
 
 def _at(profile: NDArray[Any], millimetres: float, field_mm: float) -> float:
-    """The profile at a place, between its pixels' centres."""
+    """Interpolate the profile between the centres of its pixels."""
     place = _pixel(millimetres, field_mm, len(profile)) - 0.5
     return float(np.interp(place, np.arange(len(profile)), profile))

@@ -1,4 +1,4 @@
-"""Panels that the figures of the paper have in common."""
+"""Panels shared by the figures of the paper."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ LABEL_IN, STAMP_IN = 0.3, 0.2
 
 
 def show(ax: Axes, frame: NDArray[Any], peak: float = 1.0, title: str = "") -> None:
-    """A frame in grey, 0 black and ``peak`` white, its pixels sharp."""
+    """Draw a frame in grey, from 0 (black) to ``peak`` (white), with sharp pixels."""
     ax.imshow(frame, cmap="gray", vmin=0, vmax=peak)
     bare(ax)
     if title:
@@ -32,7 +32,7 @@ def show(ax: Axes, frame: NDArray[Any], peak: float = 1.0, title: str = "") -> N
 
 
 def strip(name: str, caption: str, rows: Rows, stamps: Sequence[str], peak: float = 1.0) -> Picture:
-    """Rows of frames at the same instants, one instant per column; on narrow pages some below the others."""
+    """Draw rows of frames at the same instants, one per column; narrow pages get fewer columns."""
     narrow = strips(rows, stamps, peak, across=NARROW_ACROSS, width_in=NARROW_IN)
     return Picture(name, strips(rows, stamps, peak), caption, narrow=narrow)
 
@@ -45,9 +45,9 @@ def strips(
     across: int | None = None,
     width_in: float = WIDTH_IN,
 ) -> Figure:
-    """The same as one figure, at most ``across`` instants side by side."""
+    """Draw rows of frames as one figure, with at most ``across`` instants side by side."""
     blocks = -(-len(stamps) // (across or len(stamps)))
-    across = -(-len(stamps) // blocks)  # as many in each as can be
+    across = -(-len(stamps) // blocks)  # distribute the instants evenly over the blocks
     side_in = (width_in - LABEL_IN) / across
     shape = rows[0][1].shape
     figure = canvas(blocks * (STAMP_IN + side_in * shape[1] / shape[2] * len(rows)), width_in)
@@ -76,6 +76,6 @@ def box(ax: Axes, rows: slice, columns: slice, colour: str = HIGHLIGHT, width: f
 
 
 def correlation(a: NDArray[Any], b: NDArray[Any]) -> float:
-    """Pearson's, over what is known of both."""
+    """Return Pearson's correlation over the samples that are known in both."""
     known = np.isfinite(a) & np.isfinite(b)
     return float(np.corrcoef(a[known], b[known])[0, 1])

@@ -1,4 +1,4 @@
-"""Fig. 10: Scene #2, two seven-segment displays whose digits come and go."""
+"""Fig. 10: Scene #2, two seven-segment displays whose digits appear and disappear."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from acquire.evaluate.curves import region_mean
-from acquire.evaluate.paper.against import Row, captured, words
+from acquire.evaluate.paper.comparison import Row, captured, statement
 from acquire.evaluate.paper.drawing import box, correlation, show, strip
 from acquire.evaluate.paper.studio import PaperFigure, Picture
 from acquire.evaluate.themed import SOLVER_COLOURS, THEORY, canvas
@@ -28,10 +28,17 @@ BOXES = {
     "right, lower right": ("right", "c"),
     "right, middle bar": ("right", "g"),
 }
+"""Segments whose light is plotted → display and segment."""
+PAPER = {
+    "left, middle bar": "a continuous triangular wave",
+    "right, lower right": "a continuous triangular wave",
+    "right, middle bar": "intermittent",
+}
+"""The paper's statements about their light."""
 
 
 def figure(studio: Studio) -> PaperFigure:
-    """Digits at their peaks, and the light of three segments over time."""
+    """Show the digits at their peaks, and the light of three segments over time."""
     shot = studio.shoot("scene-digits", FIRST_LINE, LINES, "Scene #2")
     scene, video, truth, times = shot.scene, shot.video, shot.truth, shot.times_ms
     assert isinstance(scene, DigitScene)
@@ -52,8 +59,8 @@ def figure(studio: Studio) -> PaperFigure:
     return PaperFigure(
         name="fig10",
         title="Scene #2: two seven-segment displays",
-        text="2-4-6-8 on the left, 1-3-5-7 on the right; each digit rises and falls within 1.28 ms, the "
-        "displays half a period apart. 598 frames of 64 × 64 voxels from 263 lines.",
+        text="2-4-6-8 on the left, 1-3-5-7 on the right. Each digit rises and falls within 1.28 ms, and the "
+        "displays are half a period apart. 598 frames of 64 × 64 voxels from 263 lines.",
         pictures=(
             strip(
                 "frames",
@@ -67,7 +74,7 @@ def figure(studio: Studio) -> PaperFigure:
         ),
         rows=(
             *(_reading(side, *digits[side]) for side in ("left", "right")),
-            *(captured(f"{name}: light over time", _statement(name), r) for name, r in agreement.items()),
+            *(captured(f"{name}: light over time", PAPER[name], r) for name, r in agreement.items()),
             shot.accuracy(),
         ),
         seconds=dict(studio.seconds),
@@ -79,7 +86,7 @@ def figure(studio: Studio) -> PaperFigure:
 
 def _reading(side: str, read: str, shown: str) -> Row:
     right = sum(one == other for one, other in zip(read, shown, strict=True))
-    return words(
+    return statement(
         f"{side} display reads",
         "identified",
         f"{read} (shown {shown})",
@@ -88,12 +95,8 @@ def _reading(side: str, read: str, shown: str) -> Row:
     )
 
 
-def _statement(name: str) -> str:
-    return "intermittent" if name.startswith("right, middle") else "a continuous triangular wave"
-
-
 def _masks(scene: DigitScene) -> dict[tuple[str, str], NDArray[np.bool_]]:
-    """Voxels wholly behind each segment that is ever lit, by display and segment."""
+    """Return the voxels covered by each segment that is ever lit, by display and segment."""
     covered = scene.masks.reshape(-1, 64, 3, 64, 3).mean(axis=(2, 4))
     sides = ["left" if display.column < 0.5 else "right" for display, _ in scene.segments]
     return {
@@ -105,7 +108,7 @@ def _masks(scene: DigitScene) -> dict[tuple[str, str], NDArray[np.bool_]]:
 def _peaks(
     truth: NDArray[Any], masks: dict[tuple[str, str], NDArray[np.bool_]], side: str
 ) -> NDArray[np.int64]:
-    """Frames at which a digit of a display is brightest."""
+    """Return the frames at which a digit of a display is brightest."""
     own = np.any([mask for (where, _), mask in masks.items() if where == side], axis=0)
     light = truth[:, own].max(axis=1)
     peaks = [
@@ -122,7 +125,7 @@ def _peaks(
 
 
 def _read(frame: NDArray[Any], masks: dict[tuple[str, str], NDArray[np.bool_]], side: str) -> str:
-    """The digit that a display shows; ``?`` when its lit segments are no digit's."""
+    """Read the digit that a display shows; ``?`` if its lit segments form none."""
     light = {name: float(frame[mask].mean()) for (where, name), mask in masks.items() if where == side}
     lit = {name for name, value in light.items() if value > LIT * max(light.values())}
     return next((str(digit) for digit, names in enumerate(SEGMENTS) if set(names) == lit), "?")

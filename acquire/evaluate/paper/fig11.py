@@ -1,4 +1,4 @@
-"""Fig. 11: Scene #3, a chopper's blade sweeps over the target; 4000 frames from seven sub-segments."""
+"""Fig. 11: Scene #3, the blade of a chopper sweeps over the target; 4000 frames from seven sub-segments."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from acquire.evaluate.metrics import psnr, psnr_per_frame, ssim
-from acquire.evaluate.paper.against import Row, same, sooner, words
+from acquire.evaluate.paper.comparison import Row, faster, same, statement
 from acquire.evaluate.paper.drawing import strip
 from acquire.evaluate.paper.studio import PaperFigure, Picture, read, true_voxels
 from acquire.evaluate.themed import HIGHLIGHT, SOLVER_COLOURS, THEORY, canvas
@@ -24,13 +24,13 @@ BEGIN_MS, END_MS, PIECES = 30, 70, 7
 LINES = 2420
 FRAMES = 4000
 PAPER_S = 600.0
-"""What the paper takes for a segment, at least."""
+"""Least time that the paper needs for a segment."""
 AROUND = 40
-"""Frames on either side of a seam in which a jump would be seen."""
+"""Number of frames on either side of a seam in which a jump would show."""
 
 
 def figure(studio: Studio) -> PaperFigure:
-    """30 ms to 70 ms after the start."""
+    """Reconstruct 30 ms to 70 ms after the start."""
     recording = studio.record("scene-chopper", LINES)
     selection = by_time(recording, BEGIN_MS * 1_000_000, END_MS * 1_000_000)
     outcome = studio.stitch_evenly(recording, selection, Voxels(3, 1), PIECES, "chopper in 7 sub-segments")
@@ -50,19 +50,19 @@ def figure(studio: Studio) -> PaperFigure:
     return PaperFigure(
         name="fig11",
         title="Scene #3: a chopper over the target",
-        text="A blade sweeps over the target at rest. 4000 frames of 64 × 64 voxels, 10 µs apart, from seven "
-        "sub-segments that overlap as in Fig. 5, reconstructed side by side and stitched.",
+        text="A blade sweeps over a stationary target. 4000 frames of 64 × 64 voxels, 10 µs apart, from "
+        "seven sub-segments that overlap as in Fig. 5, reconstructed in parallel and stitched.",
         pictures=(
             strip(
                 "frames",
-                "(b) the blade on its way.",
+                "(b) the blade during the sweep.",
                 (("ours", video[picks]), ("truth", truth[picks])),
                 [f"{times[p]:.2f} ms" for p in picks],
             ),
             Picture(
                 "seams",
                 _seams(times, steps, true_steps, error, seams),
-                "From frame to frame, and error of each frame; yellow: the seams.",
+                "Change from frame to frame, and PSNR of each frame. Yellow: the seams.",
             ),
         ),
         rows=(
@@ -73,14 +73,14 @@ def figure(studio: Studio) -> PaperFigure:
                 equal=(len(video), len(seams) + 1) == (FRAMES, PIECES),
             ),
             Row("the sweep", "clearly presented", f"{numbers['psnr_db']:.1f} dB, SSIM {numbers['ssim']:.3f}"),
-            words(
+            statement(
                 "seams",
                 "combined together",
-                f"largest jump about a seam × {jump / usual:.2f} of the 99th percentile of all",
+                f"largest jump at a seam: {jump / usual:.2f} of the 99th percentile of all frames",
                 "no larger than elsewhere" if jump <= usual else "larger than elsewhere",
                 hold=jump <= usual,
             ),
-            sooner(
+            faster(
                 "time",
                 "“ten more minutes” for one segment",
                 f"{seconds:.0f} s for all {PIECES}",

@@ -1,4 +1,4 @@
-"""Fig. 6: the limits in space and time, intra-line against inter-line TDI."""
+"""Fig. 6: the limits in space and time of intra-line and inter-line TDI."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from acquire.evaluate.metrics import psnr
-from acquire.evaluate.paper.against import Row, captured, finer, in_elements, words
 from acquire.evaluate.paper.bars import THRESHOLD, contrasts, last_resolved, place_of
+from acquire.evaluate.paper.comparison import Row, captured, finer, in_elements, statement
 from acquire.evaluate.paper.drawing import correlation, show
 from acquire.evaluate.paper.studio import PaperFigure, Picture, scene_of
 from acquire.evaluate.themed import SOFT, SOLVER_COLOURS, THEORY, canvas
@@ -31,8 +31,8 @@ COLOUR = {INTRA: SOLVER_COLOURS[0], INTER: SOLVER_COLOURS[1]}
 PULSES_KHZ = (300, 900)
 KNOWN, NOISY = "true picture, no noise", "true picture, camera noise"
 FOUND = "reconstructed picture, camera noise"
-"""What the light is found with: the scene's own picture, which nobody has, or one that is reconstructed from
-lines of an ordinary camera; lines without noise, or that camera's."""
+"""The picture with which the light is reconstructed: the true one, which is unknown in practice, or one
+reconstructed from noisy lines; and the noise of the lines."""
 TAG = {KNOWN: "", NOISY: "_camera_noise", FOUND: "_found"}
 NOT_CAPTURED = "not captured"
 PAPER_RESOLVES = "3/5"
@@ -46,7 +46,7 @@ PAPER = {
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Curves:
-    """Light over time: where it is seen, and as it was."""
+    """Light over time: reconstructed (NaN where the code is dark) and true."""
 
     times_us: NDArray[np.float64]
     found: NDArray[np.float64]
@@ -54,7 +54,7 @@ class Curves:
 
 
 def figure(studio: Studio) -> PaperFigure:
-    """Static target by both, contrast of its bars; pulses with the still picture known, and reconstructed."""
+    """Reconstruct a static target with both kinds of TDI, and pulses with the true and a found picture."""
     pictures, noisy, gains, still = {}, {}, {}, None
     for kind in (INTER, INTRA):
         recording = studio.record("scene-usaf", LINES + FIRST, interline=kind == INTER)
@@ -67,7 +67,7 @@ def figure(studio: Studio) -> PaperFigure:
         ).cut(FIRST, LINES)
         noisy[kind] = studio.solve(shot, 1, shot.geometry.span, f"static, {kind}, camera noise").video[0]
         if kind == INTER:
-            pictures[kind] = pictures[kind] / 9  # light of 3 × 3 fine pixels
+            pictures[kind] = pictures[kind] / 9  # a coarse pixel holds the light of 3 × 3 fine pixels
         else:
             still = scene_of(recording).frames(0, 1)[0]
     assert still is not None
@@ -85,13 +85,14 @@ def figure(studio: Studio) -> PaperFigure:
     return PaperFigure(
         name="fig6",
         title="Spatial and temporal resolution",
-        text="The USAF 1951 target at rest, 192 × 192 fine pixels from 263 lines of 64 per camera, and the "
-        "same target in pulsed light. Inter-line TDI moves its charge by whole pixels: 64 × 64.",
+        text="The stationary USAF 1951 target, 192 × 192 fine pixels from 263 lines of 64 pixels per camera, "
+        "and the same target in pulsed light. Inter-line TDI moves its charge by whole pixels, which gives "
+        "64 × 64.",
         pictures=(
             Picture(
                 "static",
                 _static(pictures, still),
-                "(a), (b) the target at rest, and the truth.",
+                "(a), (b) the stationary target, and the truth.",
                 narrow_in=NARROW_STATIC_IN,
             ),
             Picture(
@@ -100,15 +101,16 @@ def figure(studio: Studio) -> PaperFigure:
             Picture(
                 "pulses",
                 _pulse_curves(curves, KNOWN),
-                "(d), (e) light over time (grey), and as found with the true still picture given, from lines "
-                "without noise. Where the code is dark nothing is seen. Pulses of 300 kHz keep step with "
-                "inter-line TDI's 600 kHz here.",
+                "(d), (e) true light over time (grey), and the light reconstructed with the true still "
+                "picture from lines without noise. It is unknown where the code is dark. The pulses of 300 "
+                "kHz are in step with the 600 kHz of inter-line TDI here.",
             ),
             Picture(
                 "pulses-found",
                 _pulse_curves(curves, FOUND),
-                "The same with nothing given: the still picture is reconstructed, too, from lines with the "
-                "noise of an ordinary camera (10 000 electrons at the brightest, 10 of read noise).",
+                "The same without the true picture: the still picture is also reconstructed, from lines with "
+                "the noise of an ordinary camera (10 000 electrons in the brightest sample, read noise of "
+                "10).",
             ),
         ),
         rows=(
@@ -118,7 +120,7 @@ def figure(studio: Studio) -> PaperFigure:
                 _element(contrast[INTRA]),
                 reached[INTRA] - place_of(PAPER_RESOLVES),
             ),
-            words(
+            statement(
                 "inter-line resolves up to",
                 "a mosaic",
                 _element(contrast[INTER]),
@@ -161,9 +163,10 @@ def _pulses(
     gain_dn_per_e: float | None = None,
     picture: NDArray[Any] | None = None,
 ) -> Curves:
-    """Both on the scene's fine sub-steps: what is found is held over a step of the sensor.
+    """Reconstruct pulsed light; both curves are on the fine sub-steps of the scene.
 
-    ``gain_dn_per_e`` of a camera with noise; ``picture`` to find the light with, else the true one.
+    The reconstructed light is constant over a step of the sensor. ``gain_dn_per_e`` is that of a noisy
+    camera; ``picture`` is the still picture to use instead of the true one.
     """
     recording = studio.record(
         f"scene-pulses-{khz}khz", LINES + FIRST, interline=kind == INTER, gain_dn_per_e=gain_dn_per_e
@@ -217,7 +220,7 @@ def _pulse_curves(curves: dict[tuple[int, str, str], Curves], way: str) -> Figur
             curve = curves[khz, kind, way]
             times = curve.times_us - origin
             step_us = np.diff(times).mean()
-            shown = (times > -step_us) & (times < SHOWN_US + step_us)  # more would only swell the file
+            shown = (times > -step_us) & (times < SHOWN_US + step_us)  # keeps the file small
             times, found = times[shown], curve.found[shown]
             ax.step(times, curve.true[shown], where="post", color=THEORY, lw=1.0)
             ax.hlines(found, times, times + step_us, color=COLOUR[kind], lw=3.0)

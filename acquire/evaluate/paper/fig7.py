@@ -1,4 +1,4 @@
-"""Fig. 7: selective reconstruction, the same lines once for detail and once for motion."""
+"""Fig. 7: selective reconstruction of the same lines, once for detail and once for motion."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import numpy as np
 from scipy.ndimage import map_coordinates
 
 from acquire.evaluate.metrics import psnr, ssim
-from acquire.evaluate.paper.against import Row, same, words
+from acquire.evaluate.paper.comparison import Row, same, statement
 from acquire.evaluate.paper.drawing import show, strip
 from acquire.evaluate.paper.studio import PaperFigure, Picture, true_voxels
 from acquire.evaluate.themed import SOLVER_COLOURS, THEORY, canvas
@@ -23,11 +23,11 @@ LINES = 1313
 NARROW_TRAJECTORY_IN = 2.6
 DETAIL, MOTION = (1, 820), (3, 4)
 PROFILE = 0.2
-"""Half length of the line across the stripes, of the scene's side."""
+"""Half the length of the line across the stripes, relative to the scene's side."""
 
 
 def figure(studio: Studio) -> PaperFigure:
-    """Two goldfish, one fast and one with fine stripes."""
+    """Reconstruct two goldfish, one fast and one with fine stripes."""
     recording = studio.record("scene-goldfish", LINES)
     segment = recording.cut(0, LINES)
     span = segment.geometry.span
@@ -46,18 +46,19 @@ def figure(studio: Studio) -> PaperFigure:
     return PaperFigure(
         name="fig7",
         title="Selective reconstruction: two goldfish",
-        text="1313 lines of 54 per camera, 2.28 ms at 1.8 million sub-steps a second. The broad-finned fish "
-        "swims a fast circle, the zebra fish turns slowly; the same lines are reconstructed twice.",
+        text="1313 lines of 54 pixels per camera, 2.28 ms at 1.8 million sub-steps per second. The "
+        "broad-finned fish swims in a fast circle, the zebra fish turns slowly. The same lines are "
+        "reconstructed twice.",
         pictures=(
             Picture(
                 "trajectory",
                 _trajectory(true_motion, motion),
-                "(a) all positions at once: the truth, and ours.",
+                "(a) all positions at once: the truth and our reconstruction.",
                 narrow_in=NARROW_TRAJECTORY_IN,
             ),
             _frames(
                 "detail",
-                "(b) N_m = 1, T_m = 820: stripes are clear, the fast fish is blurred along its way.",
+                "(b) N_m = 1, T_m = 820: the stripes are clear, the fast fish is blurred along its path.",
                 detail,
                 truth=true_detail,
                 picks=range(5),
@@ -65,27 +66,29 @@ def figure(studio: Studio) -> PaperFigure:
             ),
             _frames(
                 "motion",
-                "(d) N_m = 3, T_m = 4: the fast fish is caught, the stripes have lost contrast.",
+                "(d) N_m = 3, T_m = 4: the fast fish is sharp, the stripes have lost contrast.",
                 motion,
                 truth=true_motion,
                 picks=range(102, 1025, 205),
                 frame_ms=frame_ms[1],
             ),
             Picture(
-                "stripes", _stripes(profiles), "(c) light along a line across the stripes, over its mean."
+                "stripes",
+                _stripes(profiles),
+                "(c) light along a line across the stripes, relative to its mean.",
             ),
         ),
         rows=(
-            words(
+            statement(
                 "N_m = 1, T_m = 820",
                 "stripes clearly discerned",
                 _quality(numbers, "detail", studio),
-                f"{depth['N_m = 1'] / depth['truth']:.0%} of the stripes' true swing; half is asked",
+                f"{depth['N_m = 1'] / depth['truth']:.0%} of the stripes' true swing; 50% is required",
                 hold=depth["N_m = 1"] >= depth["truth"] / 2,
             ),
             Row("N_m = 3, T_m = 4", "fast fish clearly captured", _quality(numbers, "motion", studio)),
-            words(
-                "swing across the stripes, of their mean",
+            statement(
+                "swing across the stripes, relative to their mean",
                 "higher with N_m = 1",
                 ", ".join(f"{value:.2f} ({name})" for name, value in depth.items()),
                 f"× {depth['N_m = 1'] / depth['N_m = 3']:.2f}",
@@ -118,7 +121,7 @@ def _quality(numbers: dict[str, float], kind: str, studio: Studio) -> str:
 def _profiles(
     truth: NDArray[Any], detail: NDArray[Any], motion: NDArray[Any]
 ) -> dict[str, NDArray[np.float64]]:
-    """Light along the line through the middle on which the truth varies most, each over its mean."""
+    """Return the light along the central line on which the truth varies most, relative to its mean."""
     reach = np.linspace(-PROFILE, PROFILE, 160)
 
     def along(picture: NDArray[Any], angle: float) -> NDArray[np.float64]:
@@ -153,6 +156,6 @@ def _stripes(profiles: dict[str, NDArray[np.float64]]) -> Figure:
     place = np.linspace(-PROFILE, PROFILE, 160)
     for name, values in profiles.items():
         ax.plot(place, values, color=colours[name], lw=3 if name == "truth" else 1.4, label=name)
-    ax.set(xlabel="place along the line (side of the scene = 1)", ylabel="light over mean")
+    ax.set(xlabel="position along the line (side of the scene = 1)", ylabel="light relative to mean")
     drawing.legend(ncols=3, loc="outside upper right")
     return drawing

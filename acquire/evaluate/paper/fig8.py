@@ -1,4 +1,4 @@
-"""Fig. 8: combinatorial reconstruction, three sub-segments with voxels of their own, stitched."""
+"""Fig. 8: combinatorial reconstruction of three sub-segments with different voxels, stitched together."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from acquire.evaluate.metrics import psnr
-from acquire.evaluate.paper.against import Row, in_elements, same, words
 from acquire.evaluate.paper.bars import contrasts, last_resolved, place_of
+from acquire.evaluate.paper.comparison import Row, in_elements, same, statement
 from acquire.evaluate.paper.drawing import box, show, strip
 from acquire.evaluate.paper.studio import PaperFigure, Picture, read, true_voxels
 from acquire.evaluate.themed import canvas
@@ -30,7 +30,7 @@ CLOSE = (slice(20, 104), slice(18, 66))
 
 
 def figure(studio: Studio) -> PaperFigure:
-    """A window slides up over the target, opens, slides to the left."""
+    """Reconstruct a window that slides up over the target, opens, and slides to the left."""
     recording = studio.record("scene-window", LINES)
     outcome = studio.stitch(recording, "plan-window", 0, "three sub-segments")
     video = read(outcome)
@@ -57,13 +57,20 @@ def figure(studio: Studio) -> PaperFigure:
         name="fig8",
         title="Combinatorial reconstruction: a sliding window",
         text="Three sub-segments of 2136, 1972 and 2136 sub-steps. #A and #C are reconstructed in voxels of "
-        "N_m = 3, T_m = 4; #B, at rest, of N_m = 1, T_m = 220 (230 evened out, so that nine fill it), from "
-        "the lines that see nothing but it. One video holds them all.",
+        "N_m = 3, T_m = 4. #B, which is stationary, is reconstructed in voxels of N_m = 1, T_m = 220 (230, "
+        "adjusted so that nine fill it), from the lines that see only #B. One video holds all three.",
         pictures=(
             _strip(
                 "a", "(a), (b) #A: the window slides up.", video, truth=fine, picks=picks_a, frame_ms=frame_ms
             ),
-            _strip("b", "(d) #B: open, in fine pixels.", video, truth=fine, picks=picks_b, frame_ms=frame_ms),
+            _strip(
+                "b",
+                "(d) #B: the open window, in fine pixels.",
+                video,
+                truth=fine,
+                picks=picks_b,
+                frame_ms=frame_ms,
+            ),
             _strip(
                 "c",
                 "(e), (f) #C: the window slides to the left.",
@@ -89,10 +96,10 @@ def figure(studio: Studio) -> PaperFigure:
             Row("#A, 54 × 54, 534 frames", "sliding clearly captured", f"{numbers['a_psnr_db']:.1f} dB"),
             Row("#B, 162 × 162", "target details explored", f"{numbers['b_psnr_db']:.1f} dB"),
             Row("#C, 54 × 54, 534 frames", "sliding clearly captured", f"{numbers['c_psnr_db']:.1f} dB"),
-            words(
+            statement(
                 "bars resolved",
                 "#B significantly better",
-                f"#B {_named(resolved)}; pixels of #A and #C, without any error, {_named(open_coarse)}",
+                f"#B {_named(resolved)}; error-free pixels of the size in #A and #C {_named(open_coarse)}",
                 f"#B {in_elements(place_of(resolved) - place_of(open_coarse))}",
                 hold=place_of(resolved) > place_of(open_coarse),
             ),

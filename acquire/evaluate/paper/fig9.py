@@ -1,4 +1,4 @@
-"""Fig. 9: Scene #1, four LEDs, three of them sinusoids of 5, 2.5 and 1 kHz."""
+"""Fig. 9: Scene #1, four LEDs, three of them driven by sinusoids of 5, 2.5 and 1 kHz."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from acquire.evaluate.curves import CurveComparison, compare_curve, region_mean
-from acquire.evaluate.paper.against import Row, frequency, same, words
+from acquire.evaluate.paper.comparison import Row, frequency, same, statement
 from acquire.evaluate.paper.drawing import strip
 from acquire.evaluate.paper.studio import PaperFigure, Picture
 from acquire.evaluate.themed import SOLVER_COLOURS, THEORY, canvas
@@ -25,11 +25,11 @@ INNER = 0.9
 DETAIL_MS = 1.2
 FRAMES = 598
 STEADY = 0.05
-"""Ripple of what is constant, of its level."""
+"""Largest ripple of a constant LED, relative to its level."""
 
 
 def figure(studio: Studio) -> PaperFigure:
-    """Lines from 52 ms to 59.89 ms, frames from 52 ms to 57.98 ms."""
+    """Reconstruct lines from 52 ms to 59.89 ms, which give frames from 52 ms to 57.98 ms."""
     shot = studio.shoot("scene-leds", FIRST_LINE, LINES, "Scene #1")
     scene, segment, video, truth = shot.scene, shot.segment, shot.video, shot.truth
     assert isinstance(scene, LedScene)
@@ -46,9 +46,9 @@ def figure(studio: Studio) -> PaperFigure:
         name="fig9",
         title="Scene #1: four LEDs",
         text="263 lines of both cameras, 52 ms to 59.89 ms after the start; 598 frames of 64 × 64 voxels, "
-        "10 µs apart, 52 ms to 57.98 ms.",
+        "10 µs apart, from 52 ms to 57.98 ms.",
         pictures=(
-            Picture("lines", _lines(segment, times[0]), "(a) what the two cameras recorded."),
+            Picture("lines", _lines(segment, times[0]), "(a) the lines recorded by the two cameras."),
             strip(
                 "frames",
                 "(b) frames over one period of the circle.",
@@ -68,12 +68,12 @@ def figure(studio: Studio) -> PaperFigure:
                 equal=len(video) == FRAMES,
             ),
             *(_row(curve) for curve in curves),
-            words(
+            statement(
                 "distortion of the circle",
                 "slight, from saturation",
                 f"{curves[2].measured.distortion:.1%} (true {curves[2].theory.distortion:.1%})",
-                f"{abs(curves[2].measured.distortion - curves[2].theory.distortion):.1%} off the truth; "
-                "half of it is allowed",
+                f"{abs(curves[2].measured.distortion - curves[2].theory.distortion):.1%} from the truth; "
+                "half of the true distortion is allowed",
                 hold=abs(curves[2].measured.distortion / curves[2].theory.distortion - 1) <= 0.5,
             ),
             shot.accuracy(),
@@ -88,7 +88,7 @@ def figure(studio: Studio) -> PaperFigure:
 def _row(curve: CurveComparison) -> Row:
     if curve.constant:
         ripple = curve.measured.residual_rms / curve.measured.offset
-        return words(
+        return statement(
             f"{curve.name}: constant",
             "constant",
             f"level × {curve.level_ratio or 0:.3f}",

@@ -1,6 +1,7 @@
-"""Fig. 9 from anybody's recording of four lamps in the quarters of the field: no scene file is asked.
+"""Fig. 9 from a recording of four lamps in the quarters of the field, by any instrument and without a scene
+file.
 
-Which lamp is where is told by its light alone: the frequency of what is brightest in each quarter.
+Each lamp is identified by the frequency of its light, the brightest light in its quarter.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ from acquire.calibrate.apply import calibrated
 from acquire.calibrate.choose import choose, corrected
 from acquire.errors import UsageError
 from acquire.evaluate.curves import HARMONICS, SineFit, fit_constant, fit_sine, region_mean
-from acquire.evaluate.paper.against import Row, frequency, same, words
+from acquire.evaluate.paper.comparison import Row, frequency, same, statement
 from acquire.evaluate.paper.drawing import strip
 from acquire.evaluate.paper.studio import PaperFigure, Picture
 from acquire.evaluate.themed import SOLVER_COLOURS, THEORY, canvas
@@ -29,20 +30,20 @@ if TYPE_CHECKING:
     from acquire.store import Recording
 
 LAMPS = {"x": 5000.0, "triangle": 2500.0, "circle": 1000.0, "equals": 0.0}
-"""Of Scene #1, with their frequencies (Hz); 0: constant."""
+"""The lamps of Scene #1 and their frequencies (Hz); 0 is constant."""
 NEAR = 0.05
-"""Relative difference of a frequency that is still the lamp's."""
+"""Largest relative difference of a frequency that still identifies a lamp."""
 STEADY = 0.1
-"""Amplitude beside the mean below which a lamp is constant."""
+"""Amplitude relative to the mean below which a lamp is constant."""
 LIT, FAINT = 0.5, 0.15
-"""Of a quarter's brightest voxels, from which on a voxel is the lamp's; of the field's, for a lamp at all."""
+"""Least light of a lamp's voxel relative to its quarter's brightest, and of a lamp relative to the field."""
 LINES = 263
 QUARTERS = ("upper left", "upper right", "lower left", "lower right")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Lamp:
-    """What shines in one quarter: its mean light over time, and what was fitted."""
+    """The lamp in one quarter: its mean light over time and its fit; ``name`` is None if it is unknown."""
 
     place: str
     light: NDArray[np.float64]
@@ -51,14 +52,16 @@ class Lamp:
 
 
 def figure_of(recording: Recording, studio: Studio, first_line: int | None = None) -> PaperFigure:
-    """263 lines of the recording, with the calibration that it carries, as Fig. 9 has them.
+    """Make Fig. 9 from 263 lines of the recording, corrected by the calibration that it carries.
 
-    Raises UsageError for too few lines, and where fewer than two quarters are lit.
+    Raises UsageError for too few lines, and if fewer than two quarters are lit.
     """
     first = recording.first_available_line if first_line is None else first_line
     have = recording.first_line + recording.lines - first
     if have < LINES:
-        raise UsageError(f"{recording} has {have} lines from {first} on", possible=f"{LINES} or more")
+        raise UsageError(
+            f"{recording} has {have} lines, starting with line {first}", possible=f"{LINES} or more"
+        )
     chosen = choose(recording)
     segment = recording.cut(first, LINES)
     if chosen is not None:
@@ -67,28 +70,29 @@ def figure_of(recording: Recording, studio: Studio, first_line: int | None = Non
     result = studio.solve(segment, geometry.substeps, 1, "the recording")
     video = np.asarray(result.video[result.trusted], np.float64)
     if len(video) < 2:
-        raise UsageError(f"nothing of {recording} is to be trusted: {'; '.join(result.warnings)}")
+        raise UsageError(f"{recording} has no trusted frames: {'; '.join(result.warnings)}")
     interval_s = segment.substep_ns * 1e-9
     lamps = list(_lamps(video, interval_s))
     if len(lamps) < 2:
         raise UsageError(
-            f"{len(lamps)} of the field's quarters are lit", possible="Scene #1: a lamp in each of four"
+            f"only {len(lamps)} of the field's quarters are lit",
+            possible="Scene #1, with a lamp in each of the four quarters",
         )
     times_ms = np.arange(len(video), dtype=np.float64) * (interval_s * 1e3)
     picks = np.linspace(0, len(video) - 1, 6).astype(int)
     stamps = [f"{times_ms[k]:.2f} ms" for k in picks]
     white = float(np.percentile(video, 99.9))
     frames = strip("frames", "(b) frames over the whole time.", (("frames", video[picks]),), stamps, white)
-    what = "none" if chosen is None else ", ".join(corrected(chosen.calibration)) or "nothing"
+    applied = "nothing" if chosen is None else ", ".join(corrected(chosen.calibration)) or "nothing"
     return PaperFigure(
         name="fig9",
-        title=f"Scene #1, as {recording} has it",
-        text=f"{LINES} lines of both cameras from line {first} on; {len(video)} frames of "
-        f"{video.shape[1]} × {video.shape[2]} voxels. Corrected: {what}.",
+        title=f"Scene #1, from {recording}",
+        text=f"{LINES} lines of both cameras, starting with line {first}; {len(video)} frames of "
+        f"{video.shape[1]} × {video.shape[2]} voxels. Corrected: {applied}.",
         pictures=(
             frames,
             Picture(
-                "curves", _curves(times_ms, interval_s, lamps), "(c) mean light of each lamp, and its fit."
+                "curves", _curves(times_ms, interval_s, lamps), "(c) mean light of each lamp and its fit."
             ),
         ),
         rows=(
@@ -109,7 +113,7 @@ def figure_of(recording: Recording, studio: Studio, first_line: int | None = Non
 
 
 def _lamps(video: NDArray[np.float64], interval_s: float) -> Iterator[Lamp]:
-    """The lit quarters, row by row."""
+    """Yield the lamps of the lit quarters, row by row."""
     mean = np.maximum(video.mean(axis=0), 0)
     rows, columns = np.indices(mean.shape)
     quarter = 2 * (rows >= mean.shape[0] // 2) + (columns >= mean.shape[1] // 2)
@@ -122,32 +126,25 @@ def _lamps(video: NDArray[np.float64], interval_s: float) -> Iterator[Lamp]:
         fit = fit_sine(light, interval_s, harmonics=HARMONICS)
         if fit.amplitude < STEADY * fit.offset:
             fit = fit_constant(light)
-        yield Lamp(place, light, fit, _name(fit.frequency_hz))
-
-
-def _name(frequency_hz: float) -> str | None:
-    """Which of the paper's lamps has this frequency."""
-    return next((name for name, hz in LAMPS.items() if abs(frequency_hz - hz) <= NEAR * hz), None)
+        near = (name for name, hz in LAMPS.items() if abs(fit.frequency_hz - hz) <= NEAR * hz)
+        yield Lamp(place, light, fit, next(near, None))
 
 
 def _rows(lamps: list[Lamp]) -> list[Row]:
     rows = []
     for name, hz in LAMPS.items():
-        found = next((lamp for lamp in lamps if lamp.name == name), None)
-        expected = f"{hz:.0f} Hz" if hz else "constant"
-        rows.append(_row(f"{name}: {expected}", found, hz))
-    strange = [lamp for lamp in lamps if lamp.name is None]
-    return rows + [Row(f"{lamp.place}: none of these", "–", _told(lamp)) for lamp in strange]
+        lamp = next((each for each in lamps if each.name == name), None)
+        what = f"{name}: {f'{hz:.0f} Hz' if hz else 'constant'}"
+        paper = "same frequency as theory" if hz else "constant"
+        if lamp is None or not hz:
+            rows.append(statement(what, paper, _described(lamp), hold=lamp is not None))
+        else:
+            rows.append(frequency(what, paper, _described(lamp), lamp.fit.frequency_hz, hz))
+    unknown = [lamp for lamp in lamps if lamp.name is None]
+    return rows + [Row(f"{lamp.place}: none of these", "–", _described(lamp)) for lamp in unknown]
 
 
-def _row(what: str, lamp: Lamp | None, hz: float) -> Row:
-    paper = "same frequency as theory" if hz else "constant"
-    if lamp is None or not hz:
-        return words(what, paper, _told(lamp), hold=lamp is not None)
-    return frequency(what, paper, _told(lamp), lamp.fit.frequency_hz, hz)
-
-
-def _told(lamp: Lamp | None) -> str:
+def _described(lamp: Lamp | None) -> str:
     if lamp is None:
         return "not found"
     fit = lamp.fit

@@ -1,4 +1,4 @@
-"""All figures of the paper in one page that refers to nothing outside, and its numbers as JSON."""
+"""All figures of the paper on one page in a single file, and its numbers as JSON."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import matplotlib as mpl
 
 from acquire.evaluate.animation import FRAME_DURATION_MS, write_webp
 from acquire.evaluate.page import fill_template
-from acquire.evaluate.paper.against import Verdict
+from acquire.evaluate.paper.comparison import Verdict
 from acquire.evaluate.paper.studio import PaperFigure, Studio
 from acquire.evaluate.player import Clip, beside, clip_of
 from acquire.evaluate.summary import rounded
@@ -30,7 +30,7 @@ MOVIE_PX = 256
 
 @dataclass(frozen=True, slots=True)
 class Drawn:
-    """A figure as the page takes it in: ``facts`` as in ``summary.json``; the player's ``clip``."""
+    """A figure prepared for the page: its facts as in ``summary.json``, its drawings and its clip."""
 
     facts: dict[str, Any]
     drawings: dict[str, Drawing]
@@ -39,7 +39,7 @@ class Drawn:
 
 
 def draw(figure: PaperFigure, directory: Path, host: Busyness) -> Drawn:
-    """Write the pictures and the animation of a figure; ``host`` is what the machine was like meanwhile."""
+    """Write the pictures and the animation of a figure; ``host`` is the load of the machine."""
     with mpl.rc_context(STYLE):
         drawings = {
             each.name: save_drawing(
@@ -78,7 +78,7 @@ def draw(figure: PaperFigure, directory: Path, host: Busyness) -> Drawn:
 def write_page(
     figures: Sequence[Drawn], studio: Studio, command: str, when: datetime, recording: str | None = None
 ) -> Path:
-    """Write ``index.html`` and ``summary.json`` of drawn figures into the studio's directory."""
+    """Write ``index.html`` and ``summary.json`` of the drawn figures into the studio's directory."""
     found = Counter(row["verdict"] for each in figures for row in each.facts["rows"])
     facts = {
         "when": when.isoformat(timespec="seconds"),

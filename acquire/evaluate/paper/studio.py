@@ -1,4 +1,4 @@
-"""What every figure of the paper needs: recordings of scenes, reconstructions and the truth."""
+"""The studio that all figures of the paper share: recordings of scenes, reconstructions and the truth."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from acquire.config import load_plan, load_recorded, load_rig, load_scene
 from acquire.config.scene import OpticsConfig
 from acquire.evaluate.host import HostWatch
 from acquire.evaluate.metrics import psnr, ssim
-from acquire.evaluate.paper.against import Row
+from acquire.evaluate.paper.comparison import Row
 from acquire.recon import reconstruct
 from acquire.recon.segments import Voxels
 from acquire.reconstruct import Options, Watcher, along_plan, combine, in_voxels, open_pool
@@ -31,19 +31,19 @@ if TYPE_CHECKING:
 
     from acquire.lines import Segment
     from acquire.recon import Reconstruction
-    from acquire.reconstruct import Outcome
+    from acquire.reconstruct import Outcome, VideoRequest
     from acquire.sim.scene import Scene
     from acquire.store import Recording
 
 FULL_WELL_E, READ_NOISE_E = 1e4, 10.0
-"""Of an ordinary camera: electrons of the brightest sample, and of the noise in the dark."""
+"""An ordinary camera: electrons in the brightest sample, and read noise in electrons."""
 TRUE_PEAK = 1.0
-"""Light of the scenes at their brightest."""
+"""Brightest value of the scenes."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Picture:
-    """A drawing, with what it shows in words; on narrow pages ``narrow``, or the same ``narrow_in`` high."""
+    """A drawing with its caption. Narrow pages show ``narrow``, or the same figure ``narrow_in`` high."""
 
     name: str
     drawing: Figure
@@ -54,10 +54,10 @@ class Picture:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PaperFigure:
-    """A figure of the paper as we have it.
+    """Our version of a figure of the paper.
 
-    ``movie`` maps what is shown side by side to its frames (t, row, column); ``movie_ms`` is the time from
-    one to the next.
+    ``movie`` maps the labels of the videos shown side by side to their frames (t, row, column); ``movie_ms``
+    is the interval between two frames.
     """
 
     name: str
@@ -73,9 +73,9 @@ class PaperFigure:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Shot:
-    """Frames of a scene that were sampled in full, beside the truth, T_m = 1.
+    """The trusted frames of a scene with T_m = 1, and the truth.
 
-    ``video`` and ``truth`` (time, row, column); ``first_substep`` is that of their first frame.
+    ``video`` and ``truth`` are (time, row, column); ``first_substep`` is that of their first frame.
     """
 
     scene: Scene
@@ -87,7 +87,7 @@ class Shot:
 
     @property
     def times_ms(self) -> NDArray[np.floating[Any]]:
-        """When each frame begins, after the read-out of line 0."""
+        """Start of each frame, after the read-out of line 0."""
         geometry = self.segment.geometry
         first = self.first_substep - geometry.readout_substep
         return (first + np.arange(len(self.video))) * (self.segment.substep_ns * 1e-6)
@@ -102,7 +102,7 @@ class Shot:
 
 @dataclass(slots=True)
 class Studio:
-    """Makes recordings in ``directory`` and reconstructs them; ``say`` is told what is being done."""
+    """Makes and reconstructs recordings in ``directory``; ``say`` is called with the current activity."""
 
     directory: Path
     options: Options = field(default_factory=Options)
@@ -114,10 +114,10 @@ class Studio:
     def record(
         self, scene_name: str, lines: int, *, interline: bool = False, gain_dn_per_e: float | None = None
     ) -> Recording:
-        """A recording of a built-in scene with its rig, and this studio's exposure code; made once.
+        """Return a recording of a built-in scene with its rig and this studio's exposure code; made once.
 
-        ``interline`` looks at it with whole steps of charge instead, the baseline of Fig. 6; with
-        ``gain_dn_per_e`` by a camera that has shot noise and `READ_NOISE_E`.
+        With ``interline`` the charge moves by whole pixels, as in the baseline of Fig. 6; with
+        ``gain_dn_per_e`` the camera has shot noise and the read noise `READ_NOISE_E`.
         """
         name = f"{scene_name}-interline" if interline else scene_name
         name += "" if gain_dn_per_e is None else "-noisy"
@@ -137,11 +137,11 @@ class Studio:
         return open_recording(path)
 
     def gain(self, segment: Segment) -> float:
-        """DN per electron of a camera whose full well is the brightest sample of ``segment``."""
+        """Return the DN per electron of a camera whose full well is the brightest sample of ``segment``."""
         return float((segment.lines.max() - np.min(segment.black_level_dn)) / FULL_WELL_E)
 
     def solve(self, segment: Segment, spatial_merge: int, temporal_merge: int, what: str) -> Reconstruction:
-        """Reconstruct a segment by the studio's options; the time it takes is noted under ``what``."""
+        """Reconstruct a segment with the studio's options; its time is noted under ``what``."""
         self._begin(what)
         options = self.options
         result = reconstruct(
@@ -158,7 +158,7 @@ class Studio:
         return result
 
     def shoot(self, scene_name: str, first_line: int, lines: int, what: str) -> Shot:
-        """Record a scene, and reconstruct these lines at N_m = 3, T_m = 1."""
+        """Record a scene and reconstruct the given lines with N_m = 3, T_m = 1."""
         recording = self.record(scene_name, first_line + lines)
         segment = recording.cut(first_line, lines)
         result = self.solve(segment, 3, 1, what)
@@ -175,38 +175,27 @@ class Studio:
         )
 
     def stitch(self, recording: Recording, plan_name: str, first_line: int, what: str) -> Outcome:
-        """Reconstruct along a built-in plan from a line on, sub-segments side by side."""
-        self._begin(what)
-        plan = load_plan(plan_name)
-        request = along_plan(by_lines(recording, first_line), plan)
-        began = time.perf_counter()
-        watcher = Watcher(len(request.stretches))
-        with open_pool(len(request.stretches), watch=watcher) as pool:
-            outcome = combine(
-                recording,
-                request,
-                self.directory / f"{plan_name}.zarr",
-                options=self.options,
-                pool=pool,
-                watcher=watcher,
-            )
-        self._end(what, time.perf_counter() - began)
-        return outcome
+        """Reconstruct along a built-in plan from a line on, with the sub-segments in parallel."""
+        request = along_plan(by_lines(recording, first_line), load_plan(plan_name))
+        return self._combine(recording, request, f"{plan_name}.zarr", what)
 
     def stitch_evenly(
         self, recording: Recording, selection: Selection, voxels: Voxels, pieces: int, what: str
     ) -> Outcome:
         """Reconstruct a selection in ``pieces`` equal sub-segments."""
-        self._begin(what)
         begin, end = selection.extent(voxels, voxels, whole=False)
         request = in_voxels(selection, voxels, longest=-(-(end - begin) // pieces))
+        return self._combine(recording, request, f"{what.split(maxsplit=1)[0]}-video.zarr", what)
+
+    def _combine(self, recording: Recording, request: VideoRequest, name: str, what: str) -> Outcome:
+        self._begin(what)
         began = time.perf_counter()
         watcher = Watcher(len(request.stretches))
         with open_pool(len(request.stretches), watch=watcher) as pool:
             outcome = combine(
                 recording,
                 request,
-                self.directory / f"{what.split(maxsplit=1)[0]}-video.zarr",
+                self.directory / name,
                 options=self.options,
                 pool=pool,
                 watcher=watcher,
@@ -224,17 +213,17 @@ class Studio:
 
 
 def scene_of(recording: Recording) -> Scene:
-    """The scene as the recording describes it, as fine as its cameras can tell."""
+    """Return the scene that the recording describes, at the resolution of its cameras."""
     return bench_of(*load_recorded(recording.attrs, str(recording))).fine_scene()
 
 
 def true_voxels(
     recording: Recording, first_substep: int, count: int, spatial_merge: int, temporal_merge: int
 ) -> NDArray[np.float32]:
-    """The truth about ``count`` sub-steps of a recording, in voxels."""
+    """Return the true scene during ``count`` sub-steps of a recording, in voxels."""
     return truth(scene_of(recording), first_substep, count, spatial_merge, temporal_merge)
 
 
 def read(outcome: Outcome) -> NDArray[np.float32]:
-    """The whole of a video that was written."""
+    """Read a whole video that was written."""
     return np.asarray(open_video(outcome.path).video[:], np.float32)

@@ -1,4 +1,4 @@
-/* Shows the frames of a figure.player one by one. Keys within it: space, arrows, Home, End. */
+/* Plays the frames of each figure.player. Keys: space, arrows, Home, End. */
 for (const figure of document.querySelectorAll("figure.player")) {
   const frames = JSON.parse(figure.querySelector("script[type='application/json']").textContent);
   const labels = JSON.parse(figure.dataset.labels ?? "[]");

@@ -1,4 +1,4 @@
-"""Whose lines ``acquire camera live`` looks at: the daemon's, whatever it does, or the cameras' own."""
+"""Sources of the lines that ``acquire camera live`` shows: the daemon's rings, or the cameras themselves."""
 
 from __future__ import annotations
 
@@ -19,25 +19,27 @@ if TYPE_CHECKING:
 
     from acquire.camera.gauge import Reading
     from acquire.client import Client
-    from acquire.daemon.facts import Setup
     from acquire.daemon.messages import LightCode
 
 LATE_S = 1.0
-"""A camera that tells nothing for so long is shown as one without lines."""
+"""A camera that delivers no readings for this time is shown as one without lines."""
 MOST_BLOCKS = 4096
-"""Looked at in one turn; the rest waits for the next."""
+"""Largest number of blocks read in one turn; the rest are read in the next one."""
 ASK_S = 1.0
-"""Between two questions whether the daemon still has the cameras."""
+"""Time between two checks that the daemon is still armed."""
 
 
-class Eyes(Protocol):
-    """A context manager that looks while it is entered. ``names``: arm → the camera's serial number."""
+class LiveSource(Protocol):
+    """A context manager that reads lines while it is entered.
+
+    ``names`` maps each arm to the serial number of its camera; ``where`` describes the source.
+    """
 
     names: dict[str, str]
     where: str
 
     def take(self) -> dict[str, Reading]:
-        """The next readings, by arm; waits for them. An arm without any is absent."""
+        """Wait for the next readings and return them by arm. An arm without readings is absent."""
         ...
 
     def __enter__(self) -> Self: ...
@@ -47,8 +49,8 @@ class Eyes(Protocol):
     ) -> None: ...
 
 
-class CameraEyes:
-    """The cameras themselves, opened for as long as this lasts; the rig's trigger runs meanwhile."""
+class CameraSource:
+    """The cameras themselves, opened while this is entered, with the rig's trigger running."""
 
     def __init__(self, bench: Bench, serial: str | None) -> None:
         self._bench, self._serial = bench, serial
@@ -63,10 +65,10 @@ class CameraEyes:
             found |= camera.take(LATE_S)
         return found
 
-    def __enter__(self) -> CameraEyes:
+    def __enter__(self) -> CameraSource:
         self._end.enter_context(self._bench)
         try:
-            for serial, views in self._wanted().items():
+            for serial, views in self._views().items():
                 camera = LiveCamera(f"camera {serial}", self._bench.opener(serial), views, OPEN_S)
                 self._end.callback(camera.close)
                 self._cameras.append(camera)
@@ -74,7 +76,7 @@ class CameraEyes:
             self._bench.pulse()
             for camera in self._cameras:
                 while camera.take(0.0):
-                    pass  # from before the first line
+                    pass  # discard readings from before the first line
         except BaseException:
             self._end.close()
             raise
@@ -85,39 +87,44 @@ class CameraEyes:
     ) -> None:
         self._end.close()
 
-    def _wanted(self) -> dict[str, dict[str, View]]:
-        """Serial number → what is looked at of that camera, by arm."""
+    def _views(self) -> dict[str, dict[str, View]]:
+        """Map serial numbers to the views of that camera, by arm."""
         config = self._bench.config
         if config is None:
-            assert self._serial is not None  # else there would be a daemon, or a rig
+            assert self._serial is not None  # otherwise `open_source` has found a daemon or a rig
             return {self._serial: {"camera": View()}}
-        asked = ARMS if self._serial is None else self._bench.arms(self._serial)
-        wanted: dict[str, dict[str, View]] = {}
-        for arm in asked:
+        arms = ARMS if self._serial is None else self._bench.arms(self._serial)
+        views: dict[str, dict[str, View]] = {}
+        for arm in arms:
             camera = config.cameras.arm(arm)
             view = View(config.columns.get(arm), camera.black_level_dn, camera.white_dn)
-            wanted.setdefault(camera.serial, {})[arm] = view
-        return wanted
+            views.setdefault(camera.serial, {})[arm] = view
+        return views
 
 
-class RingEyes:
-    """What the daemon's rings pass on: nobody waits for who looks. Ends where the daemon disarms."""
+class RingSource:
+    """The lines in the daemon's rings. The daemon never waits for this reader; it ends when that disarms."""
 
     def __init__(self, client: Client, serial: str | None) -> None:
-        """Raises StateError where the daemon has no cameras open."""
+        """Raises StateError if the daemon is not armed, UsageError if its rig has no such camera."""
         from acquire.web.places import shape_of
 
         status, setup, rings = client.status(), client.setup(), client.rings()
         if not rings.arms:
             raise StateError(
-                f"the daemon is {status.state}: no lines come",
+                f"the daemon is {status.state}, so that no lines are arriving",
                 possible="armed or recording",
-                hint="acquire arm, or --config RIG to look at the cameras without the daemon",
+                hint="acquire arm, or --config RIG to open the cameras without the daemon",
+            )
+        serials = {arm: str(setup.config["cameras"][arm]["serial"]) for arm in ARMS}
+        if serial is not None and serial not in serials.values():
+            raise UsageError(
+                f"the rig has no camera {serial!r}", possible=", ".join(dict.fromkeys(serials.values()))
             )
         self._client, self._run_id = client, rings.run_id
         self._asked_s = time.monotonic()
-        self.names = _named(setup, serial)
-        self.where = f"the daemon's, which is {status.state}"
+        self.names = {arm: name for arm, name in serials.items() if serial in (None, name)}
+        self.where = f"lines of the daemon, which is {status.state}"
         self._gauges = {
             arm: Gauge(setup.black_dn[arm], setup.white_dn) for arm in rings.arms if arm in self.names
         }
@@ -133,22 +140,20 @@ class RingEyes:
         if time.monotonic() > self._asked_s + ASK_S:
             self._asked_s = time.monotonic()
             if self._client.rings().run_id != self._run_id:
-                raise StateError("the daemon has disarmed: no more lines come", hint="acquire arm")
+                raise StateError("the daemon was disarmed, so no more lines are arriving", hint="acquire arm")
         for arm, peek in self._peeks.items():
-            self._drain(peek, self._gauges[arm])
+            gauge = self._gauges[arm]
+            for _ in range(MOST_BLOCKS):
+                block = peek.next()
+                if block is None:
+                    break
+                measured = gauge.look(block.pixels, block.flags, sum(loss.count for loss in block.losses))
+                del block  # the daemon may overwrite it at any moment
+                if peek.took():  # it was not overwritten while it was measured
+                    gauge.keep(measured)
         return {arm: gauge.take() for arm, gauge in self._gauges.items()}
 
-    def _drain(self, peek: Peek, gauge: Gauge) -> None:
-        for _ in range(MOST_BLOCKS):
-            block = peek.next()
-            if block is None:
-                return
-            seen = gauge.look(block.pixels, block.flags, sum(loss.count for loss in block.losses))
-            del block  # it may be overwritten at any moment
-            if peek.took():
-                gauge.keep(seen)
-
-    def __enter__(self) -> RingEyes:
+    def __enter__(self) -> RingSource:
         return self
 
     def __exit__(
@@ -158,10 +163,10 @@ class RingEyes:
             peek.close()
 
 
-def eyes_of(config: str | None, serial: str | None, code: LightCode | None, client: Client) -> Eyes:
-    """Where to look: a rig's cameras if a file is named, else the daemon's, else one of the environment's."""
+def open_source(config: str | None, serial: str | None, code: LightCode | None, client: Client) -> LiveSource:
+    """Return the cameras of a rig file if one is given, else the daemon's, else one of the environment's."""
     if config is not None:
-        return CameraEyes(Bench(config, code or "rig"), serial)
+        return CameraSource(Bench(config, code or "rig"), serial)
     try:
         client.status()
     except NoDaemonError as error:
@@ -169,18 +174,10 @@ def eyes_of(config: str | None, serial: str | None, code: LightCode | None, clie
             raise NoDaemonError(
                 error.message, hint="acquire serve, or --config RIG to open the cameras"
             ) from error
-        return CameraEyes(Bench(None), serial)
+        return CameraSource(Bench(None), serial)
     if code is not None:
         raise UsageError(
-            "--code cannot change the light of cameras that the daemon has", hint=f"acquire arm --code {code}"
+            "--code cannot change the light while the daemon uses the cameras",
+            hint=f"acquire arm --code {code}",
         )
-    return RingEyes(client, serial)
-
-
-def _named(setup: Setup, serial: str | None) -> dict[str, str]:
-    serials = {arm: str(setup.config["cameras"][arm]["serial"]) for arm in ARMS}
-    if serial is not None and serial not in serials.values():
-        raise UsageError(
-            f"the rig has no camera {serial!r}", possible=", ".join(dict.fromkeys(serials.values()))
-        )
-    return {arm: name for arm, name in serials.items() if serial in (None, name)}
+    return RingSource(client, serial)

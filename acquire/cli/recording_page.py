@@ -1,0 +1,153 @@
+"""What `acquire info` and `acquire ls` show: the facts of a recording in words and columns."""
+
+from __future__ import annotations
+
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from acquire.cli.output import quantity
+from acquire.text import shortened
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+LISTED = 20
+"""Number of items of a list that are printed; --json has all of them."""
+
+MOST_NS = 2**62
+"""Upper limit of a time after 1970 that a calendar date can express; a clock this uncertain is unknown."""
+
+CELL_CHARACTERS = 72
+"""Longest error text in a table; --json has all of it."""
+
+COLUMNS = ("recording", "lines", "duration", "size", "state", "started (UTC)")
+
+
+def list_row(facts: dict[str, Any]) -> tuple[str, ...]:
+    """Return the row of a recording in a list, or of a directory that cannot be read as one."""
+    name = Path(facts["path"]).name
+    if "error" in facts:
+        # One line of limited length, because an error may quote what is on the disk.
+        why = " ".join(facts["error"].removeprefix(facts["path"]).lstrip(": ").split())
+        why = why if len(why) <= CELL_CHARACTERS else why[: CELL_CHARACTERS - 1] + "…"
+        return (name, "-", "-", "-", why, "-")
+    state = (facts["run_condition"] or facts["state"]) + (", DAMAGED" if facts["damage"] else "")
+    size = quantity(facts["bytes"], "B")
+    return (name, str(facts["lines"]), f"{facts['duration_s']:.3f} s", size, state, _utc(facts["start_ns"]))
+
+
+def recording_facts(facts: dict[str, Any]) -> dict[str, Any]:
+    """Return the facts of one recording by their labels; None for those that do not apply."""
+    from acquire.store.terms import ALL_LINES
+
+    sizes, segment, missing = facts["geometry"], facts["segment"], facts["calibration_missing"]
+    first, lines = facts["first_line"], facts["lines"]
+    uncertainty_ns = facts["clock"]["uncertainty_ns"]
+    utc = "UTC unknown" if uncertainty_ns >= MOST_NS else f"UTC known to {uncertainty_ns} ns"
+
+    def ranges(key: str) -> str | None:
+        """Format ranges of lines. One without an end is held for a copy that is still running."""
+        return _some(
+            [
+                f"{start} on" if count >= ALL_LINES else f"{start} to {start + count - 1}"
+                for start, count, *_ in facts[key]
+            ]
+        )
+
+    continues = calibration = None
+    if segment is not None:  # it continues a recording after an outage
+        outage = segment["outage"]
+        lost = "the numbering restarted" if outage["lines"] is None else f"{outage['lines']} lines"
+        continues = f"{segment['of']} after line {outage['after_line']}; outage: {lost}, {outage['cause']}"
+    if missing is not None:
+        calibration = f"none: {missing}, named in the rig file, did not exist"
+    elif steps := dict((facts["calibration"] or {}).get("steps", {})):
+        calibration = f"{', '.join(steps)}; {max(str(step.get('made', '')) for step in steps.values())}"
+    suspect = [
+        f"{one['arm']} {one['first_line']} to {one['first_line'] + one['count'] - 1} ({one['why']})"
+        for one in facts["suspect"]
+    ]
+    return {
+        "recording": facts["path"],
+        "run": facts["run_id"],
+        "state": f"{facts['state']}, {facts['run_condition'] or 'no condition yet'}",
+        "end": facts["end_reason"],
+        "lines": f"{lines} ({first} to {first + lines - 1})" if lines else "0",
+        "continues": continues,
+        "segments": ", ".join(facts["segments"]) or None,
+        "dropped": ranges("dropped"),
+        "held": ranges("holds"),
+        "duration": f"{facts['duration_s']:.6f} s at {quantity(facts['line_rate_hz'], 'Hz')}",
+        "started": _utc(facts["start_ns"]),
+        "geometry": f"M = {sizes['stages']}, S = {sizes['substeps']}, {sizes['pixels']} pixels",
+        "scene": _behind_fibre(sizes),
+        "samples": facts["dtype"],
+        "code": ", ".join(f"{key} {shortened(value, 60)}" for key, value in facts["code"].items()),
+        "clock": f"{facts['clock']['clock_hz']} Hz, {utc}",
+        "size": quantity(facts["bytes"], "B"),
+        "damaged": facts["damage"],
+        "disk": _disk(facts["disk"]),
+        "at risk": _at_risk(facts["durability"]),
+        "lost lines": ", ".join(f"{arm} {count}" for arm, count in facts["lost_lines"].items()),
+        "in doubt": _some(suspect),
+        "calibration": calibration,
+        "simulated": "yes" if facts["simulated"] else "no",
+        "imported": _imported(facts["imported"]),
+        "written by": f"acquire {facts['versions']['acquire']}",
+    }
+
+
+def _some(items: Sequence[str]) -> str | None:
+    """Join up to `LISTED` items and count the others; None if there are none."""
+    more = [f"and {len(items) - LISTED} more"] if len(items) > LISTED else []
+    return ", ".join([*items[:LISTED], *more]) or None
+
+
+def _imported(found: dict[str, Any] | None) -> str | None:
+    """The source files of an imported recording, and what is not known about its lines."""
+    if found is None:
+        return None
+    files = dict.fromkeys(str(file.get("path")) for file in dict(found.get("files", {})).values())
+    return f"from {', '.join(files)}; not known: {'; '.join(map(str, found.get('unknown', ())))}"
+
+
+def _behind_fibre(sizes: dict[str, Any]) -> str | None:
+    """The size of a scene behind a fibre, its tiles and its fibre bands."""
+    if (fibre := sizes.get("fibre")) is None:
+        return None
+    side = sizes["stages"] * sizes["substeps"]
+    tiles = f"{fibre['rows'] // side} x {fibre['columns'] // side} tiles of {side} x {side}"
+    bands = " and ".join(str(len(fibre["bands"][arm])) for arm in ("a", "b"))
+    return (
+        f"{fibre['rows']} x {fibre['columns']} fine pixels behind a fibre, {tiles}; "
+        f"{bands} fibre bands on arms a and b"
+    )
+
+
+def _disk(disk: dict[str, float] | None) -> str | None:
+    """How long a growing recording can continue on its disk."""
+    if disk is None:
+        return None
+    free, rate = quantity(disk["free_bytes"], "B"), quantity(disk["bytes_per_s"], "B/s")
+    seconds = min(disk["seconds_to_full"], timedelta.max.total_seconds() / 2)
+    return f"{free} free, full in {timedelta(seconds=round(seconds))} at {rate}"
+
+
+def _at_risk(durability: dict[str, Any]) -> str | None:
+    """The number of lines that a crash can cost."""
+    if not durability:
+        return None
+    kill, power = durability["kill_lines"], durability["power_lines"]
+    at_power = (
+        f"at most {power} lines" if power is not None else "all that the system has not written to disk"
+    )
+    return f"kill -9: at most {kill} lines; power loss: {at_power} (fsync at {durability['fsync']})"
+
+
+def _utc(time_ns: int | None) -> str:
+    if time_ns is None:
+        return "-"
+    if not 0 <= time_ns < MOST_NS:
+        return f"{time_ns} ns after 1970"
+    return datetime.fromtimestamp(time_ns / 1e9, UTC).strftime("%Y-%m-%d %H:%M:%S.%f")
