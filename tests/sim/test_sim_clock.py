@@ -91,7 +91,7 @@ def test_stop_keeps_the_count_and_is_idempotent(wire, clock):
 
 def test_a_train_cannot_start_while_another_runs_but_after_it(wire, clock):
     first = wire.start(LINE_PERIOD_NS, Fraction(1), CODE_ATTRS)
-    with pytest.raises(DeviceError, match="train 1 still runs"):
+    with pytest.raises(DeviceError, match="train 1 is still running"):
         wire.start(LINE_PERIOD_NS, Fraction(1), CODE_ATTRS)
     wire.stop()
     second = wire.start(LINE_PERIOD_NS, Fraction(2), {"kind": "constant", "value": 1})
@@ -125,7 +125,7 @@ def test_wait_sees_a_start_and_a_stop_that_come_meanwhile(wire, clock):
 
 
 def test_a_code_that_does_not_fit_is_refused_and_leaves_the_wire_whole(wire):
-    with pytest.raises(UsageError, match="on the wire"):
+    with pytest.raises(UsageError, match="too long for the wire"):
         wire.start(LINE_PERIOD_NS, Fraction(1), {"kind": "x" * 5000})
     assert wire.read().train is None
 

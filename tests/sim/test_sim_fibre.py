@@ -84,7 +84,7 @@ def test_lines_do_not_depend_on_how_they_are_read():
 def test_a_scene_with_a_layout_of_its_own_is_refused():
     for optics in ({"layout": "compact"}, {"a": {"turn_deg": 90}}):
         with pytest.raises(
-            UsageError, match=r"the scene has optics of its own, .* possible: a scene without"
+            UsageError, match=r"the scene has \[optics\] of its own, .* possible: a scene without"
         ):
             read(flat(optics=optics), "a", 0, 1)
 

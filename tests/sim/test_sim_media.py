@@ -119,10 +119,10 @@ def bad_files(tmp_path):
         ("complex.npy", "complex"),
         ("rateless.npy", "frame rate"),
         ("noise.mp4", "neither a picture nor a video"),
-        ("cut.npy", "no array"),
-        ("objects.npy", "no array"),
+        ("cut.npy", "not an array"),
+        ("objects.npy", "not an array"),
         ("cut.png", "cut.png"),
-        ("missing.mp4", "no such file"),
+        ("missing.mp4", "does not exist"),
     ],
 )
 def test_what_is_no_scene_is_refused_when_it_is_opened(tmp_path, name, words):
