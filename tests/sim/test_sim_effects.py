@@ -266,7 +266,7 @@ def test_light_in_part_of_a_sub_step():
         expected = 300.0 + 0.4 * S * shared.sum(axis=(1, 2))
         np.testing.assert_allclose(seen, np.broadcast_to(expected[:, None], seen.shape), atol=0.51)
     for kind in ("led_rise_fall", "trigger_jitter"):
-        with pytest.raises(UsageError, match=f"{kind} cannot be simulated with a light"):
+        with pytest.raises(UsageError, match=f"effect {kind!r} cannot be simulated with light"):
             replace(bench(flat(listed=effects(kind))), lit_part=(0.0, 0.5)).camera("a", CODE)
 
 
