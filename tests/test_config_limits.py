@@ -36,9 +36,9 @@ def rig_text() -> str:
         (b"\xff\xfex = 1", "byte 0 is not UTF-8"),
         (b"x = 1\0", "not TOML"),
         (b"#" * (MOST_FILE_BYTES + 1), "larger than"),
-        (b"a = 1\n" + b"\n".join(b"k%d = 1" % i for i in range(5000)), "mend"),
+        (b"a = 1\n" + b"\n".join(b"k%d = 1" % i for i in range(5000)), " error(s)"),
         (b'x = "' + b"y" * 50_000 + b'"', "x"),
-        (b'"' + b"y" * 50_000 + b'" = 1', "mend"),
+        (b'"' + b"y" * 50_000 + b'" = 1', " error(s)"),
     ],
 )
 def test_files_that_no_hand_wrote(
@@ -55,7 +55,7 @@ def test_files_that_no_hand_wrote(
 def test_what_is_no_file_is_not_read(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "pipe.toml")
     for odd in (tmp_path / "pipe.toml", Path("/dev/zero"), Path("/dev/null")):
-        with pytest.raises(ConfigError, match="no regular file"):
+        with pytest.raises(ConfigError, match="not a regular file"):
             load_rig(odd)
 
 
@@ -154,9 +154,9 @@ def test_memory_is_compared_with_the_host_s(tmp_path: Path, monkeypatch: pytest.
 
 
 def test_a_camera_without_intra_line_steps_gets_none() -> None:
-    with pytest.raises(ConfigError, match="moves its charge once a line"):
+    with pytest.raises(ConfigError, match="moves its charge once per line"):
         load_rig("rig-vt-4k5c-h100", {"geometry.substeps": 3})
-    with pytest.raises(ConfigError, match=r"TDIStages is 'TDI192', and geometry\.stages is 64"):
+    with pytest.raises(ConfigError, match=r"TDIStages is 'TDI192', but geometry\.stages is 64"):
         load_rig("rig-vt-4k5c-h100", {"geometry.stages": 64})
     assert load_rig("rig-vt-4k5c-h100").line_rate_hz == 100_000
 
@@ -170,16 +170,16 @@ FIBRE |= {"fibre.rows": 128, "fibre.columns": 192, "fibre.sensor_pixels": 400}
     [
         (
             {"cameras.layout": "dual"},
-            "[fibre] goes with another cameras.layout than 'dual'; possible: 'fibre'",
+            "[fibre] cannot be used with cameras.layout = 'dual'; possible: 'fibre'",
         ),
         (
             {"cameras.layout": "compact", "cameras.b.serial": "SIM-A"},
-            "[fibre] goes with another cameras.layout than 'compact'",
+            "[fibre] cannot be used with cameras.layout = 'compact'",
         ),
         ({"fibre.rows": 100}, "100 rows is no whole number of bands of n = 64; possible: a multiple of 64"),
         ({"fibre.sensor_pixels": 383}, "sensor A with 383 columns is too narrow for 2 bands of 192"),
         ({"fibre.bands_b": [0, 100, 256]}, "bands of 128 columns from 0, 100, 256 on do not lie beside each"),
-        ({"stream.ring_seconds": 1000.0}, "lines of 400 pixels are"),
+        ({"stream.ring_seconds": 1000.0}, "lines of 400 pixels need"),
     ],
 )
 def test_a_fibre_that_does_not_fit_is_refused(changes: dict[str, object], words: str) -> None:
@@ -197,9 +197,9 @@ def test_a_fibre_needs_its_table() -> None:
 @pytest.mark.parametrize(
     ("setting", "said", "hint"),
     [
-        ("recording.directory=/data", "holds no TOML value", "\"recording.directory='/data'\""),
-        ("code.seed=", "holds no TOML value", ""),
-        ("name='lab", "holds no TOML value", ""),
+        ("recording.directory=/data", "has no valid TOML value", "\"recording.directory='/data'\""),
+        ("code.seed=", "has no valid TOML value", ""),
+        ("name='lab", "has no valid TOML value", ""),
         ("code.seed", "has no '='", ""),
     ],
 )

@@ -142,8 +142,8 @@ def test_tokens_that_others_can_read_are_none(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("settings", "words"),
     [
-        ({"host": "0.0.0.0"}, "can be reached from elsewhere"),
-        ({"certificate": "c.pem"}, "belong together"),
+        ({"host": "0.0.0.0"}, "can be reached from other hosts"),
+        ({"certificate": "c.pem"}, "must be given together"),
         ({"port": 99999}, "less than or equal to 65535"),
     ],
 )
