@@ -122,7 +122,7 @@ def test_a_file_that_is_none_of_ours_is_refused(tmp_path: Path, content: str) ->
     path = tmp_path / "tokens"
     path.write_text(content)
     path.chmod(0o600)
-    with pytest.raises(UsageError, match="not one of ours"):
+    with pytest.raises(UsageError, match="is not valid"):
         load_tokens(path)
 
 

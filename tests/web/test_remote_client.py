@@ -74,7 +74,7 @@ def test_scripts_steer_from_elsewhere_as_from_here(
     assert "from elsewhere" in [news.text for news in client.events(history=True, timeout_s=0)]
     with pytest.raises(StateError, match="cannot stop while armed"):
         client.stop()
-    with pytest.raises(UsageError, match="for looking only"):
+    with pytest.raises(UsageError, match="a viewer's token cannot change anything"):
         Client(address, token=page.viewer).disarm()
     with pytest.raises(UsageError, match="missing or wrong"):
         Client(address).status()

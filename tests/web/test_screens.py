@@ -146,7 +146,7 @@ STATES: dict[str, tuple[Callable[[Instrument], None], str, str, str]] = {
     "lost": (lose, "lost", "lines lost", "246 lines were lost"),
     "faulted": (fail, "fault", "fault", "camera b does not answer"),
     "disk nearly full": (fill_disk, "degraded", "degraded", "the disk is full in 4 min"),
-    "stale": (go_silent, "", "no news", "has no daemon"),
+    "stale": (go_silent, "", "no contact", "cannot reach the daemon"),
 }
 
 
@@ -298,7 +298,9 @@ def test_a_key_that_does_nothing_says_why(browser: Browser, instrument: Instrume
         instrument.close()
         page.wait_for_selector("body[data-stale]", timeout=SEEN_MS)
         page.keyboard.press("s")
-        page.locator(error, has_text="cannot stop: The page's server has no daemon").wait_for(timeout=SEEN_MS)
+        page.locator(error, has_text="cannot stop: The page's server cannot reach the daemon").wait_for(
+            timeout=SEEN_MS
+        )
     assert instrument.run.names == ["arm"]
 
 
@@ -316,13 +318,13 @@ def test_a_viewer_looks_and_a_stranger_is_asked(browser: Browser, instrument: In
         page.wait_for_selector("body[data-state=idle]", timeout=SEEN_MS)
         assert page.is_disabled("#arm")
         page.keyboard.press("a")
-        page.locator("#error", has_text="looking only").wait_for(timeout=SEEN_MS)
+        page.locator("#error", has_text="logged in as a viewer").wait_for(timeout=SEEN_MS)
         assert instrument.server.viewer not in page.url
         (cookie,) = context.cookies()
         assert (cookie["httpOnly"], cookie["sameSite"]) == (True, "Strict")
         assert instrument.server.viewer not in str(cookie)
     log = instrument.server.log.read_text()
-    assert "enters from 127.0.0.1" in log
+    assert "logged in from 127.0.0.1" in log
     assert instrument.server.viewer not in log
 
 
