@@ -1,4 +1,4 @@
-"""Rig files that no hand wrote, and values that no host can honour, are refused in a sentence at check."""
+"""Malformed rig files, and values that no host can honour, are refused with a sentence by the check."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def rig_text() -> str:
         (b'"' + b"y" * 50_000 + b'" = 1', " error(s)"),
     ],
 )
-def test_files_that_no_hand_wrote(
+def test_malformed_files_are_refused(
     load: Callable[[Path], object], tmp_path: Path, content: bytes, words: str
 ) -> None:
     file = tmp_path / "x.toml"
@@ -52,20 +52,20 @@ def test_files_that_no_hand_wrote(
     assert len(str(caught.value)) < SENTENCE_CHARACTERS
 
 
-def test_what_is_no_file_is_not_read(tmp_path: Path) -> None:
+def test_special_files_are_not_read(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "pipe.toml")
     for odd in (tmp_path / "pipe.toml", Path("/dev/zero"), Path("/dev/null")):
         with pytest.raises(ConfigError, match="not a regular file"):
             load_rig(odd)
 
 
-def test_a_mark_of_the_editor_s_before_the_text_is_none_of_it(tmp_path: Path, rig_text: str) -> None:
+def test_a_byte_order_mark_is_ignored(tmp_path: Path, rig_text: str) -> None:
     file = tmp_path / "rig.toml"
     file.write_text("\ufeff" + rig_text, encoding="utf-8")
     assert load_rig(file) == load_rig("rig-demo")
 
 
-def test_a_rig_that_names_no_scene_is_given_the_one_that_is_asked_for(tmp_path: Path) -> None:
+def test_a_rig_without_a_scene_gets_the_requested_one(tmp_path: Path) -> None:
     sizes = 'name = "bare"\n[geometry]\nstages = 16\nsubsteps = 2\n'
     bare = sizes + '[cameras.a]\nserial = "A"\n[cameras.b]\nserial = "B"\n'
     (tmp_path / "bare.toml").write_text(bare)
@@ -108,7 +108,7 @@ def test_a_rig_that_names_no_scene_is_given_the_one_that_is_asked_for(tmp_path: 
     ],
     ids=lambda value: value if isinstance(value, str) and len(value) < 50 else type(value).__name__,
 )
-def test_values_that_are_none_name_their_key(key: str, value: object) -> None:
+def test_invalid_values_name_their_key(key: str, value: object) -> None:
     with pytest.raises(ConfigError) as caught:
         load_rig("rig-demo", {key: value})
     assert key in str(caught.value)
@@ -116,7 +116,7 @@ def test_values_that_are_none_name_their_key(key: str, value: object) -> None:
 
 
 def test_every_number_has_its_limits() -> None:
-    """A number without an upper limit fails somewhere behind, where nobody can say which key it was."""
+    """A number without an upper limit would fail later, where its key is no longer known."""
     open_ended: list[str] = []
     for name, model in RigConfig.model_json_schema()["$defs"].items():
         for key, found in model["properties"].items():
@@ -143,7 +143,7 @@ def test_what_would_fail_at_start_is_refused_at_check(
     assert words in str(caught.value)
 
 
-def test_memory_is_compared_with_the_host_s(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_memory_is_compared_with_that_of_the_host(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     changes = {"recording.directory": str(tmp_path), "geometry.stages": 4096, "stream.ring_seconds": 1.0}
     monkeypatch.setattr(host, "memory_bytes", lambda: 64 * 10**9)
     check_host(load_rig("rig-demo", changes))
@@ -203,7 +203,7 @@ def test_a_fibre_needs_its_table() -> None:
         ("code.seed", "has no '='", ""),
     ],
 )
-def test_a_setting_that_is_no_toml_is_shown_as_it_would_be(setting: str, said: str, hint: str) -> None:
+def test_a_setting_that_is_not_toml_is_shown_corrected(setting: str, said: str, hint: str) -> None:
     with pytest.raises(ConfigError, match=said) as caught:
         parse_settings([setting])
     assert caught.value.hint.endswith(hint)

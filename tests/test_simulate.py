@@ -1,4 +1,4 @@
-"""From a scene to a recording without a daemon, and what its effects are worth."""
+"""From a scene to a recording without a daemon, and the influence of its effects."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def test_a_simulated_recording_is_equation_1_with_its_code_and_time(tmp_path):
 
 
 def test_blocks_read_ahead_by_two_threads_are_those_of_one(tmp_path):
-    """What is kept between blocks (frames, tiles, charge) is never touched by two threads at once."""
+    """State kept between blocks (frames, tiles, charge) is never used by two threads at once."""
     window = {"kind": "window", "phases": [{"duration_s": 7e-3, "axis": "row"}]}
     table = listed("shot_noise", "cti").model_dump(mode="json") | {"shutters": [window]}
     scene = LedSceneConfig.model_validate(table)
@@ -104,7 +104,7 @@ def test_nothing_exists_after_a_refusal_and_what_fails_later_says_so(tmp_path, m
     assert "function later" in recording.attrs["end_reason"]
 
 
-def test_an_interrupted_simulation_is_sealed_with_what_it_has(tmp_path):
+def test_an_interrupted_simulation_is_sealed_with_its_lines(tmp_path):
     def interrupt(done, total):
         raise KeyboardInterrupt
 
@@ -114,7 +114,7 @@ def test_an_interrupted_simulation_is_sealed_with_what_it_has(tmp_path):
     assert (recording.lines, recording.attrs["run_condition"]) == (1024, "INTERRUPTED")
 
 
-def test_the_study_ranks_effects_by_what_they_do():
+def test_the_study_ranks_effects_by_their_influence():
     scene = listed(
         "shot_noise", {"kind": "read_noise", "sigma_e": 0.01}, {"kind": "beam_splitter", "part_a": 0.4}
     )

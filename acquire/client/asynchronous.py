@@ -223,7 +223,7 @@ class AsyncClient:
                 f"the daemon on {self._target} did not answer within {limit_s:g} s"
             ) from error
         except (OSError, h11.RemoteProtocolError) as error:
-            raise NoDaemonError(f"the daemon on {self._target} closed the connection") from error
+            raise NoDaemonError(f"the daemon on {self._target} has closed the connection") from error
         finally:
             await _close(writer)
 

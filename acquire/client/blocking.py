@@ -251,7 +251,7 @@ class Client:
                     yield from reader.take(line.decode().rstrip("\r\n"))
             except (OSError, http.client.HTTPException) as error:
                 raise NoDaemonError(
-                    f"the daemon on {self._target} closed the connection while it was sending news"
+                    f"the daemon on {self._target} has closed the connection while it was sending news"
                 ) from error
         raise NoDaemonError(f"the daemon on {self._target} has ended")
 
@@ -283,7 +283,7 @@ class Client:
                 ) from error
             except (OSError, http.client.HTTPException) as error:
                 raise _BrokenError(
-                    f"the daemon on {self._target} closed the connection during {call.name}"
+                    f"the daemon on {self._target} has closed the connection during {call.name}"
                 ) from error
 
     @contextlib.contextmanager

@@ -218,7 +218,9 @@ class EventReader:
             try:
                 item = (Status if event == "status" else News).model_validate_json(data)
             except ValidationError as error:
-                raise AcquireError("the daemon sends news of another version of this program") from error
+                raise AcquireError(
+                    "the daemon runs another version of this program: its news cannot be read"
+                ) from error
             if isinstance(item, News):
                 self.last_id = item.id
             yield item

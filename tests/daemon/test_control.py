@@ -176,7 +176,10 @@ def test_daemon_that_does_not_answer(path: Path, monkeypatch: pytest.MonkeyPatch
     with socket.socket(socket.AF_UNIX) as listener:
         listener.bind(str(deaf))
         listener.listen(1)
-        with Client(deaf) as client, pytest.raises(NoDaemonError, match=r"did not answer status within 0\.2 s"):
+        with (
+            Client(deaf) as client,
+            pytest.raises(NoDaemonError, match=r"did not answer status within 0\.2 s"),
+        ):
             client.status()
 
 

@@ -1,4 +1,4 @@
-"""The first hour on the page, in a real browser: dark, flat, target, a sweep of delays that is cancelled."""
+"""Calibration on the page in a real browser: dark, flat, target, and a cancelled sweep of delays."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The optics' blur on the page, in a real browser: told where no edges are, found where there are some."""
+"""The optics' blur on the page in a real browser: an error without edges, a finding with them."""
 
 from __future__ import annotations
 
