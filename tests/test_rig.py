@@ -139,7 +139,7 @@ def without_scene(driver):
 def test_simulated_cameras_without_a_scene_are_refused_with_a_list_of_scenes(tmp_path, driver):
     (tmp_path / "rig.toml").write_text(without_scene(driver))
     with pytest.raises(
-        ConfigError, match=r"simulation\.scene is missing.*scene-leds.*try: simulation\.scene"
+        ConfigError, match=r"simulation\.scene is missing.*scene-leds.*try: set simulation\.scene"
     ):
         load_rig(tmp_path / "rig.toml")
 

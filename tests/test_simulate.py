@@ -104,7 +104,7 @@ def test_a_refusal_leaves_nothing_and_a_later_failure_a_sealed_recording(tmp_pat
     assert "function later" in recording.attrs["end_reason"]
 
 
-def test_an_interrupted_simulation_is_sealed_with_what_it_has(tmp_path):
+def test_an_interrupted_simulation_is_sealed_with_its_lines(tmp_path):
     def interrupt(done, total):
         raise KeyboardInterrupt
 
@@ -114,7 +114,7 @@ def test_an_interrupted_simulation_is_sealed_with_what_it_has(tmp_path):
     assert (recording.lines, recording.attrs["run_condition"]) == (1024, "INTERRUPTED")
 
 
-def test_the_study_ranks_effects_by_what_they_do():
+def test_the_study_ranks_effects_by_their_influence():
     scene = listed(
         "shot_noise", {"kind": "read_noise", "sigma_e": 0.01}, {"kind": "beam_splitter", "part_a": 0.4}
     )

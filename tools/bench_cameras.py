@@ -75,9 +75,9 @@ def feed_pattern(mailbox: Mailbox, memory: CameraMemory, load: Load) -> None:
     wanted, start_ns, line = False, 0, 0
     while True:
         mailbox.take()
-        if memory.asked:
+        if memory.request_pending:
             # The ring keeps its position: line 0 of a session is the next row at which the pattern begins.
-            wanted = memory.obey(memory["SESSION"])
+            wanted = memory.acknowledge(memory["SESSION"])
             memory["HEAD"] = memory["TAIL"] = memory["HEAD"] // capacity * capacity + capacity
             start_ns, line = time.monotonic_ns(), 0
         due = int((time.monotonic_ns() - start_ns) / load.period_ns) if wanted else 0

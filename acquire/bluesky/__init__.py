@@ -1,4 +1,4 @@
-"""The instrument as a bluesky device: a plan records with it, and documents say where the lines are.
+"""The instrument as a bluesky device: a plan records with it, and documents state where the lines are.
 
 ::
 
@@ -13,7 +13,7 @@
     yield from bps.kickoff(recorder, wait=True)                           # recording
     yield from bps.abs_set(recorder.mark, "the valve opens")
     yield from bps.collect_while_completing([recorder], [recorder], flush_period=1.0, stream_name="lines")
-    yield from bps.unstage(recorder)                                      # as it was found
+    yield from bps.unstage(recorder)                                      # as it was before
 
 Needs the extra ``bluesky``; the service itself does not.
 """

@@ -1,7 +1,7 @@
-"""What a plan's documents say of a recording: where its lines are, and which of them can be read by now.
+"""The documents of a recording: where its lines are, and which of them can be read so far.
 
-Index i of a StreamResource is row i of its arrays. A recording that continues in a further segment is a
-further StreamResource for each arm, whose indices begin at 0 again.
+Index i of a StreamResource is row i of its arrays. A recording that continues in another segment has another
+StreamResource for each arm, whose indices start at 0 again.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ def key_of(name: str, arm: str) -> str:
 
 
 def data_keys(name: str, rig: RigConfig) -> dict[str, DataKey]:
-    """One key per arm; an event is one line."""
+    """Return one key per arm; an event is one line."""
     return {
         key_of(name, arm): {
             "source": f"acquire://{quote(rig.name)}/{arm}/lines",
@@ -49,17 +49,20 @@ def data_keys(name: str, rig: RigConfig) -> dict[str, DataKey]:
 
 @dataclass(slots=True)
 class Segment:
-    """One recording on disk: how many rows a reader can see in both arms, and how many documents cover."""
+    """One recording on disk: rows that are readable in both arms, and rows that documents cover."""
 
     path: Path
     first_line: int | None = None
     lines: int = 0
-    told: int = 0
+    covered: int = 0
     bundles: list[ComposeStreamResourceBundle] = field(default_factory=list)
 
 
 class Account:
-    """The segments of one recording, in their order, and what has been told of each; ``budget`` in lines."""
+    """The segments of one recording, in order, and the lines of each that documents cover.
+
+    ``budget`` is in lines.
+    """
 
     def __init__(self, name: str, rig: RigConfig, path: Path, budget: int | None) -> None:
         self._name, self._rig = name, rig
@@ -72,42 +75,44 @@ class Account:
 
     @property
     def reach(self) -> int:
-        """Lines from the first to the last, including those between two segments that neither has."""
+        """Lines from the first to the last, including those missing between two segments."""
         first, last = self.segments[0].first_line, self.now.first_line
         return self.now.lines + (0 if first is None or last is None else last - first)
 
     @property
-    def untold(self) -> list[Segment]:
-        return [segment for segment in self.segments if segment.told < segment.lines]
+    def uncovered(self) -> list[Segment]:
+        """Segments with lines that no document covers yet."""
+        return [segment for segment in self.segments if segment.covered < segment.lines]
 
     @property
     def index(self) -> int:
-        """Lines that documents can tell of after the next `tell`, which tells of one segment."""
-        told = sum(segment.told for segment in self.segments)
-        return told + sum(segment.lines - segment.told for segment in self.untold[:1])
+        """Lines that documents can cover after the next `documents`, which is about one segment."""
+        covered = sum(segment.covered for segment in self.segments)
+        return covered + sum(segment.lines - segment.covered for segment in self.uncovered[:1])
 
-    def tell(self, index: int) -> Iterator[StreamAsset]:
-        """Documents for the lines up to ``index`` that none covers yet.
+    def documents(self, index: int) -> Iterator[StreamAsset]:
+        """Yield documents for the lines up to ``index`` that none covers yet.
 
-        They are of one segment, the first that has such lines: the RunEngine takes one range at a time.
+        They are about one segment, the first with such lines, because the RunEngine takes one range at a
+        time.
         """
-        for segment in self.untold[:1]:
-            told = sum(one.told for one in self.segments)
-            stop = min(segment.lines, segment.told + index - told)
-            if stop <= segment.told:
+        for segment in self.uncovered[:1]:
+            covered = sum(each.covered for each in self.segments)
+            stop = min(segment.lines, segment.covered + index - covered)
+            if stop <= segment.covered:
                 return
             if not segment.bundles:
-                segment.bundles = [self._bundle(segment, arm) for arm in ARMS]
+                uri = f"file://localhost{quote(str(segment.path))}"
+                for arm in ARMS:
+                    parameters: dict[str, Any] = {
+                        "dataset": f"{arm}/lines",
+                        "chunk_shape": (self._rig.chunk_lines, self._rig.pixels),
+                    }
+                    bundle = ComposeStreamResource()(MIMETYPE, uri, key_of(self._name, arm), parameters)
+                    segment.bundles.append(bundle)
                 for bundle in segment.bundles:
                     yield "stream_resource", bundle.stream_resource_doc
+            covered_range = StreamRange(start=segment.covered, stop=stop)
             for bundle in segment.bundles:
-                yield "stream_datum", bundle.compose_stream_datum(StreamRange(start=segment.told, stop=stop))
-            segment.told = stop
-
-    def _bundle(self, segment: Segment, arm: str) -> ComposeStreamResourceBundle:
-        parameters: dict[str, Any] = {
-            "dataset": f"{arm}/lines",
-            "chunk_shape": (self._rig.chunk_lines, self._rig.pixels),
-        }
-        uri = f"file://localhost{quote(str(segment.path))}"
-        return ComposeStreamResource()(MIMETYPE, uri, key_of(self._name, arm), parameters)
+                yield "stream_datum", bundle.compose_stream_datum(covered_range)
+            segment.covered = stop

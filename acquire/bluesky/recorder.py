@@ -2,11 +2,11 @@
 
 ::
 
-    stage      idle → armed                    unstage    a recording under way is stopped; armed → idle
-    prepare    how much is to be recorded                 where this device armed it
+    stage      idle → armed                    unstage    stops its recording; armed → idle, if this
+    prepare    sets how much to record                    device armed it
     kickoff    armed → recording
-    complete   until that is sealed: waits for the budget, or stops a recording without one
-    collect    StreamResource once, StreamDatum for the lines that were committed since
+    complete   waits until it is sealed, by its budget, or stops a recording without one
+    collect    StreamResource once, StreamDatum for the lines committed since the last call
 """
 
 from __future__ import annotations
@@ -37,15 +37,15 @@ if TYPE_CHECKING:
     from ophyd_async.core import DeviceMock
 
 PATIENCE_S = 30.0
-"""How long `complete` waits for a daemon that does not answer: a supervisor may restart it, and the new one
-says what it found."""
+"""Longest wait of `complete` for a daemon that does not answer: a supervisor may restart it, and the new one
+reports what it found."""
 POLL_S = 0.1
 
 log = logging.getLogger("acquire.bluesky")
 
 
 class Marker(Device, Movable[str]):
-    """Setting it to a text marks the newest line with that text."""
+    """Marks the newest line with the text that it is set to."""
 
     def __init__(self, client: AsyncClient) -> None:
         self._client = client
@@ -57,20 +57,20 @@ class Marker(Device, Movable[str]):
 
 
 class Recorder(Device, Stageable, Preparable, Flyable, Collectable, WritesStreamAssets):
-    """One instrument, whose recordings must be readable from this host, too.
+    """One instrument, whose recordings must also be readable from this host.
 
-    A recording that faults, that somebody else ends before its budget, or whose daemon dies fails the status
-    of `complete`, with what happened in words; what was committed can be collected all the same.
+    The status of `complete` fails, with the reason, if the recording has a fault, if somebody else ends it
+    before its budget, or if its daemon dies; the committed lines can be collected even then.
     """
 
     def __init__(self, place: Path | str | None = None, *, token: str | None = None, name: str = "") -> None:
         """``place`` and ``token`` as for `acquire.client.Client`."""
         self._client = AsyncClient(place, token=token)
-        # A plan that fails unstages while a kickoff may be waiting for the daemon's answer: the recording
-        # which that starts must be known before it can be stopped.
+        # A plan that fails unstages while a kickoff may still be waiting for the daemon's answer, and the
+        # recording that it starts must be known before it can be stopped.
         self._commands = asyncio.Lock()
-        # `complete` and `get_index` update the account at once, and each waits for files in between: both
-        # would append the same further segment.
+        # `complete` and `get_index` may update the account concurrently, and both wait for files in between:
+        # without a lock they would append the same segment twice.
         self._updating = asyncio.Lock()
         self._staged = self._armed = False
         self._request = StartRequest()
@@ -84,11 +84,11 @@ class Recorder(Device, Stageable, Preparable, Flyable, Collectable, WritesStream
         timeout: float = DEFAULT_TIMEOUT,
         force_reconnect: bool = False,  # noqa: ARG002
     ) -> None:
-        """Raises NoDaemonError where nobody answers, and UsageError for a mock."""
+        """Check that the daemon answers. Raises NoDaemonError if it does not, and UsageError for a mock."""
         if mock:
             raise UsageError(
                 f"{self.name}: there is no mock of the instrument",
-                hint="acquire serve --config rig-demo, a real service whose devices are simulated",
+                hint="use acquire serve --config rig-demo, a real service with simulated devices",
             )
         async with asyncio.timeout(timeout):
             await self._client.version()
@@ -97,14 +97,14 @@ class Recorder(Device, Stageable, Preparable, Flyable, Collectable, WritesStream
 
     @AsyncStatus.wrap
     async def stage(self) -> None:
-        """Raises StateError where somebody records already, DeviceError where a fault waits to be read."""
+        """Arm the instrument. Raises StateError if somebody else is recording, DeviceError after a fault."""
         async with self._commands:
             status = await self._client.status()
             if status.state is State.FAULTED:
                 raise fault_error(status.fault)
             if status.state not in SEALED:
                 raise StateError(
-                    f"{self.name}: the instrument is {status.state} for somebody else",
+                    f"{self.name}: the instrument is {status.state} for another user",
                     possible="stage once it is idle or armed",
                     hint="acquire status",
                 )
@@ -115,7 +115,7 @@ class Recorder(Device, Stageable, Preparable, Flyable, Collectable, WritesStream
 
     @AsyncStatus.wrap
     async def prepare(self, value: StartRequest) -> None:
-        """What `kickoff` will ask for; without it, a recording with no end but `complete`."""
+        """Set the request of `kickoff`; without it, the recording lasts until `complete` stops it."""
         if not isinstance(value, StartRequest):
             raise UsageError(
                 f"{self.name}: cannot prepare with {value!r}", possible="StartRequest(duration_s=1.0)"
@@ -124,33 +124,34 @@ class Recorder(Device, Stageable, Preparable, Flyable, Collectable, WritesStream
 
     @AsyncStatus.wrap
     async def kickoff(self) -> None:
-        """Raises StateError unless it is staged, and UsageError, recording nothing more, where this host does
-        not see the recording.
+        """Start the recording. Raises StateError unless it is staged.
+
+        Raises UsageError, and stops the recording, if this host cannot access it.
         """
         async with self._commands:
             if not self._staged:
                 raise StateError(
-                    f"{self.name} is not staged: when a plan fails, only what it staged is stopped",
+                    f"{self.name} is not staged, so that it could not be stopped if the plan failed",
                     possible="bps.stage(recorder), or bluesky.preprocessors.stage_decorator",
                 )
             rig = await self._rig()
             status = await self._client.call(core.command("start", Status, self._request))
-            made = status.recording or status.last  # the latter if it was over at once
-            if made is None:
-                raise DeviceError(f"{self.name}: the daemon does not know the recording that it started")
+            recording = status.recording or status.last  # the latter if it has ended already
+            if recording is None:
+                raise DeviceError(f"{self.name}: the daemon did not report the recording that it started")
             budget = status.recording.budget_lines if status.recording else self._request.lines
-            self._account = Account(self.name, rig, made.path, budget)
-            if not await asyncio.to_thread(made.path.exists):
+            self._account = Account(self.name, rig, recording.path, budget)
+            if not await asyncio.to_thread(recording.path.exists):
                 await self._stop()
                 raise UsageError(
-                    f"{self.name}: the daemon records to {made.path}, which this host does not see",
+                    f"{self.name}: the daemon records to {recording.path}, which does not exist on this host",
                     hint="run the plan on the daemon's host, or mount its recordings at the same path",
                 )
 
     @WatchableAsyncStatus.wrap
     async def complete(self) -> AsyncIterator[WatcherUpdate[int]]:
-        """Ends once the recording is sealed; raises DeviceError unless it became what was asked for."""
-        account, request = self._under_way(), self._request
+        """Wait until the recording is sealed. Raises DeviceError unless it has its full budget."""
+        account, request = self._current_account(), self._request
         is_open = all(limit is None for limit in (request.lines, request.duration_s, request.post_s))
         while True:
             status = await self._status_patiently()
@@ -164,16 +165,16 @@ class Recorder(Device, Stageable, Preparable, Flyable, Collectable, WritesStream
             if is_open and status.state is State.RECORDING:
                 await self._stop()
             await asyncio.sleep(POLL_S)
-        if self._staged:  # otherwise `unstage` stopped it, and the plan knows
+        if self._staged:  # otherwise `unstage` stopped it, on behalf of the plan
             self._check_outcome(account, status)
 
     @AsyncStatus.wrap
     async def unstage(self) -> None:
-        """However the plan ended: stop the recording that it started, and disarm what it armed."""
+        """Stop the recording that the plan started, and disarm if it armed, however the plan ended."""
         async with self._commands:
             if not self._staged:
                 return
-            # First of all: `complete`, which may still be waiting, must not take our stop for a stranger's.
+            # First, so that `complete`, which may still be waiting, does not report this stop as a failure.
             self._staged, armed, self._armed = False, self._armed, False
             try:
                 await self._stop_recording(disarm=armed)
@@ -181,6 +182,7 @@ class Recorder(Device, Stageable, Preparable, Flyable, Collectable, WritesStream
                 log.warning("%s: there is nothing left to stop: %s", self.name, error)
 
     async def _stop_recording(self, *, disarm: bool) -> None:
+        """Stop the plan's recording, wait until none is being sealed, and disarm."""
         while True:
             status, account = await self._client.status(), self._account
             ours = (
@@ -197,7 +199,7 @@ class Recorder(Device, Stageable, Preparable, Flyable, Collectable, WritesStream
             await self._client.disarm()
 
     async def _stop(self) -> None:
-        """Stop what is recorded, unless it has ended since the daemon was asked."""
+        """Stop the recording, unless it has ended since the last status."""
         with contextlib.suppress(StateError):
             await self._client.stop()
 
@@ -207,11 +209,11 @@ class Recorder(Device, Stageable, Preparable, Flyable, Collectable, WritesStream
         return data_keys(self.name, await self._rig())
 
     async def get_index(self) -> int:
-        """Lines that `collect` can cover: those that a reader can see."""
-        account = self._under_way()
+        """Return the number of readable lines, which `collect` can cover."""
+        account = self._current_account()
         try:
             status = await self._client.status()
-        except NoDaemonError:  # `complete` fails with it; what was committed stays
+        except NoDaemonError:  # `complete` fails with it, but committed lines can still be collected
             status = None
         await self._update_account(account, status)
         return account.index
@@ -221,7 +223,7 @@ class Recorder(Device, Stageable, Preparable, Flyable, Collectable, WritesStream
             return
         if index is None:
             index = await self.get_index()
-        for document in self._account.tell(index):
+        for document in self._account.documents(index):
             yield document
 
     async def read_configuration(self) -> dict[str, Reading[Any]]:
@@ -239,7 +241,7 @@ class Recorder(Device, Stageable, Preparable, Flyable, Collectable, WritesStream
         }
 
     async def _facts(self) -> dict[str, str | float]:
-        """The configuration in short; everything else is in the recording's own attributes."""
+        """Return a summary of the configuration; the rest is in the recording's own attributes."""
         setup = await self._client.setup()
         facts = {
             "rig": setup.name,
@@ -253,17 +255,19 @@ class Recorder(Device, Stageable, Preparable, Flyable, Collectable, WritesStream
     async def _rig(self) -> RigConfig:
         return RigConfig.model_validate((await self._client.setup()).config)
 
-    # ---- what the daemon says
+    # ---- the daemon's reports
 
-    def _under_way(self) -> Account:
+    def _current_account(self) -> Account:
         if self._account is None:
-            raise StateError(f"{self.name} records nothing", possible="bps.kickoff(recorder, wait=True)")
+            raise StateError(
+                f"{self.name} has not started a recording", possible="bps.kickoff(recorder, wait=True)"
+            )
         return self._account
 
     async def _update_account(self, account: Account, status: Status | None) -> bool:
-        """Update ``account`` from what the daemon says, or from the files once the recording is over.
+        """Update ``account`` from the daemon's status, or from the files once the recording has ended.
 
-        Returns whether it is still under way.
+        Returns True while the recording continues.
         """
         async with self._updating:
             now = None if status is None else status.recording
@@ -271,11 +275,11 @@ class Recorder(Device, Stageable, Preparable, Flyable, Collectable, WritesStream
                 try:
                     await asyncio.to_thread(_add_segment, account, now.path)
                 except (PlaceError, DataError):
-                    return True  # what has only just begun cannot be read yet
+                    return True  # a segment that has only just begun cannot be read yet
             if now is not None and now.path == account.now.path:
                 first_line = account.now.first_line
-                # The daemon may name a new segment while its numbers are still those of the one before: they
-                # count once their first line is the segment's own.
+                # The daemon may report the path of a new segment with the counts of the previous one: counts
+                # are valid once their first line is the segment's own.
                 if first_line in (None, now.first_line):
                     account.now.first_line = now.first_line
                     account.now.lines = max(account.now.lines, now.committed_lines)
@@ -294,35 +298,36 @@ class Recorder(Device, Stageable, Preparable, Flyable, Collectable, WritesStream
             await asyncio.sleep(POLL_S)
 
     def _check_outcome(self, account: Account, status: Status) -> None:
+        """Raise DeviceError unless the recording is sealed, complete and fully covered by one collect."""
         path = account.now.path
         attrs = open_recording(path).attrs
         if attrs["state"] != "sealed":
             raise DeviceError(
-                f"{self.name}: the daemon that recorded {path} has ended; the one that answers now, process "
+                f"{self.name}: the daemon that recorded {path} has ended; the present daemon, process "
                 f"{status.pid}, is {status.state}",
-                hint="acquire status: it recovers what was recorded",
+                hint="acquire status shows how the recording is recovered",
             )
         condition, reason = attrs["run_condition"], attrs["end_reason"]
         if condition in (RunCondition.ABORTED, RunCondition.INTERRUPTED):
             raise DeviceError(f"{self.name}: {path} is {condition}, {account.reach} lines: {reason}")
         if account.budget is not None and account.reach < account.budget:
             raise DeviceError(f"{self.name}: {path} has {account.reach} of {account.budget} lines: {reason}")
-        if len(account.untold) > 1:
-            paths = ", ".join(str(segment.path) for segment in account.untold)
+        if len(account.uncovered) > 1:
+            paths = ", ".join(str(segment.path) for segment in account.uncovered)
             raise DeviceError(
                 f"{self.name}: one collect cannot cover all segments of the recording: {paths}",
-                hint="bps.collect_while_completing(..., flush_period=1.0) covers one after the other",
+                hint="bps.collect_while_completing(..., flush_period=1.0) covers them one after another",
             )
         if condition != RunCondition.GOOD:
             log.warning("%s: %s is %s: %s", self.name, path, condition, reason)
 
 
 def _add_segment(account: Account, path: Path) -> None:
-    """Add the recording at ``path``, if it continues the one under way and is not somebody's next."""
-    following, until_now = open_recording(path), open_recording(account.now.path)
-    known, found = segment_of(until_now.attrs), segment_of(following.attrs)
+    """Add the recording at ``path`` if it continues the current one, and is not another user's."""
+    next_segment, current = open_recording(path), open_recording(account.now.path)
+    known, found = segment_of(current.attrs), segment_of(next_segment.attrs)
     if found is None or found[0] != (known[0] if known is not None else account.now.path.name):
         return
-    # What was left of a killed recorder is recovered, and may then hold lines that are in both.
-    account.now.lines = min(until_now.lines, following.first_line - until_now.first_line)
-    account.segments.append(Segment(path, following.first_line))
+    # A recording recovered after its recorder was killed may contain lines that the next segment has, too.
+    account.now.lines = min(current.lines, next_segment.first_line - current.first_line)
+    account.segments.append(Segment(path, next_segment.first_line))

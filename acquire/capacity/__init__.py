@@ -1,5 +1,5 @@
-"""What this host sustains: the whole capture path under given loads, and its parts one by one.
+"""Measure what this host sustains: the whole capture path under given loads, and its parts separately.
 
-`load` what is to be held · `run` it · `latency` of its grabbers · `search` the highest rate without loss ·
-`parts` ring, codec and disk by themselves, and whether a configuration can hold
+`load` defines a load · `run` runs it · `latency` measures its grabbers · `search` finds the highest rate
+without loss · `parts` measures ring, codec and disk separately, and so whether a configuration is feasible
 """

@@ -1,4 +1,4 @@
-"""How late a simulated camera's blocks are when they have come to rest in the ring: counted, never stored."""
+"""Latency of a simulated camera's blocks until they are in the ring, as a histogram."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 
 class Latencies:
-    """A histogram in shared memory: one process adds, any reads. Steps of 10 µs up to 0.2 s."""
+    """A histogram in shared memory with bins of 10 µs up to 0.2 s: one process adds, any number read."""
 
     STEP_NS, BINS = 10_000, 20_000
 
@@ -32,15 +32,15 @@ class Latencies:
         self._words[:] = memoryview(bytes((self.BINS + 1) * WORD_BYTES)).cast("q")
 
     def percentiles_ms(self) -> dict[str, float]:
-        """Upper ends of the steps, at most the latest of all; 0 where nothing was added."""
-        reached = np.cumsum(np.array(self._words[: self.BINS]))
-        latest_ns = int(self._words[self.BINS])
-        found = {"max": latest_ns / 1e6}
+        """Return percentiles as upper edges of their bins, at most the maximum; 0 if nothing was added."""
+        cumulative = np.cumsum(np.array(self._words[: self.BINS]))
+        longest_ns = int(self._words[self.BINS])
+        percentiles = {"max": longest_ns / 1e6}
         for name, part in (("p50", 0.5), ("p99", 0.99), ("p99.9", 0.999)):
-            step = int(np.searchsorted(reached, part * reached[-1]))
-            is_last = step >= self.BINS - 1  # it holds whatever was later, too
-            found[name] = (latest_ns if is_last else min((step + 1) * self.STEP_NS, latest_ns)) / 1e6
-        return found
+            step = int(np.searchsorted(cumulative, part * cumulative[-1]))
+            is_last = step >= self.BINS - 1  # the last bin also holds everything longer
+            percentiles[name] = (longest_ns if is_last else min((step + 1) * self.STEP_NS, longest_ns)) / 1e6
+        return percentiles
 
     def close(self) -> None:
         """Release the memory. Idempotent."""
@@ -53,7 +53,7 @@ class Latencies:
 
 @dataclass(frozen=True, slots=True)
 class TimedOpener:
-    """Opens a camera that notes how late its blocks were when they came to rest in the ring."""
+    """Opens a camera that records the latency of its blocks until they are in the ring."""
 
     opener: CameraOpener
     latencies: Latencies
@@ -63,7 +63,7 @@ class TimedOpener:
 
 
 class TimedCamera:
-    """A simulated camera and a stopwatch; see `TimedOpener`."""
+    """A simulated camera that is timed; see `TimedOpener`."""
 
     def __init__(self, camera: Camera, latencies: Latencies) -> None:
         assert isinstance(camera, SimulatedCamera)
@@ -73,6 +73,7 @@ class TimedCamera:
         return getattr(self._camera, name)
 
     def release(self, block: CameraBlock) -> None:
+        # The grabber releases a block once it is in the ring.
         last = block.first_line + len(block.flags) - 1
         self._latencies.add(time.monotonic_ns() - int(self._camera.times_ns(last, 1)[0]))
         self._camera.release(block)

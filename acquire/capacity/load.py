@@ -1,4 +1,4 @@
-"""What cameras deliver and how it is recorded, as measurements of a host are told it."""
+"""A load for measurements of a host: what the cameras deliver, and how it is recorded."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ CLOCK_HZ = 90_000_000
 
 @dataclass(frozen=True, slots=True)
 class Load:
-    """What two cameras deliver, and how it is recorded; as `acquire.config` names these."""
+    """What two cameras deliver, and how it is recorded; the names are those of `acquire.config`."""
 
     pixels: int
     dtype: str
@@ -42,12 +42,12 @@ class Load:
 
     @classmethod
     def of(cls, config: RigConfig, chosen: Codec | None = None) -> Load:
-        """What a rig's cameras deliver, and how it is recorded; ``chosen``: where its codec is ``auto``."""
+        """Return the load of a rig; ``chosen`` is the codec to use if the rig's is ``auto``."""
         stream, recording = config.stream, config.recording
         codec = chosen if recording.codec == "auto" else recording.codec
         if codec is None:
             raise UsageError(
-                "a load cannot have the codec 'auto'", possible=", ".join(CODECS), hint="choose it first"
+                "a load cannot have the codec 'auto'", possible=", ".join(CODECS), hint="choose one first"
             )
         return cls(
             pixels=config.pixels,
@@ -66,7 +66,7 @@ class Load:
 
     @property
     def line_bytes(self) -> int:
-        """Bytes of pixels that one line of both arms has."""
+        """Bytes of pixels in one line of both arms."""
         return len(ARMS) * self.pixels * np.dtype(self.dtype).itemsize
 
     @property
@@ -75,17 +75,17 @@ class Load:
 
     @property
     def substep_ticks(self) -> int:
-        """Of a fixed clock; the rate is what the nearest whole number makes of it."""
+        """Duration of a sub-step in ticks of a fixed clock, rounded to a whole number."""
         return max(5, round(CLOCK_HZ / (self.line_rate_hz * self.substeps)))
 
     @property
     def speed(self) -> float:
-        """Simulated seconds per second that make up for the rounding."""
+        """Simulated seconds per second that compensate for the rounding of the sub-step."""
         return round(self.line_rate_hz * self.substeps * self.substep_ticks / CLOCK_HZ, 4)
 
 
 def tag_every_lines(load: Load) -> int:
-    """Tags at least once a block, and four times a ring."""
+    """Return the lines per tag: at least one tag per block, and four per ring."""
     return min(load.block_lines, load.ring_slots * load.block_lines // 4)
 
 
@@ -94,12 +94,12 @@ def _code() -> PrbsCode:
 
 
 def trigger_run(load: Load) -> TriggerRun:
-    """What a trigger would be asked to do."""
+    """Return the trigger's run for a load."""
     return TriggerRun("load", _code(), load.substeps, load.substep_ticks, tag_every_lines(load))
 
 
 def recording_spec(load: Load, clock: ClockFit) -> RecordingSpec:
-    """What a recording of the load would be told."""
+    """Return the specification of a recording of the load."""
     camera = {"white_dn": 255, "black_level_dn": 0.0, "responsivity_dn": 1.0}
     rate_hz = load.line_rate_hz
     chunk_lines = load.chunk_lines or usual_chunk_lines(load.line_bytes // len(ARMS), rate_hz)

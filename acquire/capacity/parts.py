@@ -1,7 +1,7 @@
-"""What ring, codec and disk of this host sustain, one by one and as the recorder uses them: a second in all.
+"""Measure what ring, codec and disk of this host sustain, separately and together, in about a second.
 
-Every part works through lines as they come from a camera, flat out, in this thread. A part that is too slow
-by itself is too slow in the capture path; and all of them share the host's processors.
+Every part processes lines like those of a camera, as fast as it can, in this thread. A part that is too slow
+on its own is too slow in the capture path, where all parts share the host's processors.
 """
 
 from __future__ import annotations
@@ -32,16 +32,16 @@ if TYPE_CHECKING:
     from acquire.capacity.load import Load
 
 PART_S = 0.15
-"""How long each part is made to work."""
+"""Duration of each part's measurement."""
 _BLOCKS = 8
-"""Different ones, so that a processor's cache does not hold them all."""
+"""Number of different blocks per arm: too many for a processor's cache to hold them all."""
 _PREFIX = ".capacity-"
 _CLOCK = ClockFit(90_000_000, 0, 0)
 
 
 @dataclass(frozen=True, slots=True)
 class Pace:
-    """How fast something takes lines, of both arms each: by the clock, and by the processor time it takes."""
+    """Throughput in lines of both arms, by the clock and in processor time."""
 
     lines_per_s: float
     cpu_s_per_line: float
@@ -49,7 +49,7 @@ class Pace:
 
 @dataclass(frozen=True, slots=True)
 class Parts:
-    """Paces of a load's parts. ``recorder`` is tags, codec, checksum and disk together, as in a recording."""
+    """Pace of each part. ``recorder`` is tags, codec, checksum and disk together, as in a recording."""
 
     load: Load
     ring: Pace
@@ -59,7 +59,7 @@ class Parts:
 
     @property
     def limits(self) -> dict[str, float]:
-        """Line rate in Hz that each part allows; ``processors``: all of them together."""
+        """Line rate in Hz that each part allows; ``processors`` is the rate at which all cores are busy."""
         return {
             "ring": self.ring.lines_per_s,
             "codec": self.codec.lines_per_s,
@@ -69,35 +69,40 @@ class Parts:
 
     @property
     def limit(self) -> str:
-        """The part that allows least."""
+        """The part that allows the lowest rate."""
         return min(self.limits, key=self.limits.__getitem__)
 
     @property
     def line_rate_hz(self) -> float:
-        """What all of them allow."""
+        """The line rate that all parts allow."""
         return self.limits[self.limit]
 
 
 def measure_parts(load: Load, directory: Path) -> Parts:
-    """Measure, with a recording below ``directory`` that is gone afterwards.
+    """Measure all parts, with a recording below ``directory`` that is removed afterwards.
 
-    Raises what a recording there would be refused with.
+    Raises the same errors as creating a recording there would.
     """
     patterns = [Pattern(arm, load.pixels, load.dtype, 255) for arm in ARMS]
     blocks = [
         pattern.lines(k * load.block_lines, load.block_lines) for k in range(_BLOCKS) for pattern in patterns
     ]
+
+    def pack(k: int) -> int:
+        crc32c(encode(blocks[k % len(blocks)], load.codec).data)
+        return load.block_lines
+
     return Parts(
         load,
         ring=_pace_of_ring(load, blocks),
-        codec=_pace_of_codec(load, blocks),
+        codec=_pace(pack),
         recorder=_pace_of_recorder(load, blocks, directory),
         cores=len(os.sched_getaffinity(0)),
     )
 
 
 def _pace(work: Callable[[int], int], finish: Callable[[], object] = lambda: None) -> Pace:
-    """Of ``work(k)``, which does the k-th piece and returns its lines of one arm."""
+    """Return the pace of ``work(k)``, which processes the k-th block and returns its lines of one arm."""
     begun_s, begun_cpu_s, lines, k = time.perf_counter(), time.process_time(), 0, 0
     while time.perf_counter() - begun_s < PART_S or k < len(ARMS):
         lines += work(k)
@@ -108,7 +113,7 @@ def _pace(work: Callable[[int], int], finish: Callable[[], object] = lambda: Non
 
 
 def _pace_of_ring(load: Load, blocks: list[NDArray[Any]]) -> Pace:
-    """What a grabber does with a block, and the recorder's side of it."""
+    """Measure the work of a grabber on a block, and the recorder's side of the ring."""
     ring = Ring("capacity", RingShape(2, load.block_lines, load.pixels, load.dtype))
 
     def pass_through(k: int) -> int:
@@ -127,28 +132,20 @@ def _pace_of_ring(load: Load, blocks: list[NDArray[Any]]) -> Pace:
         ring.close()
 
 
-def _pace_of_codec(load: Load, blocks: list[NDArray[Any]]) -> Pace:
-    def pack(k: int) -> int:
-        crc32c(encode(blocks[k % len(blocks)], load.codec).data)
-        return load.block_lines
-
-    return _pace(pack)
-
-
 def _pace_of_recorder(load: Load, blocks: list[NDArray[Any]], directory: Path) -> Pace:
-    # What processes that were killed while they measured have left; their number is in its name.
-    for left in directory.glob(f"{_PREFIX}*.zarr"):
-        if not Path("/proc", left.stem.removeprefix(_PREFIX)).exists():
-            shutil.rmtree(left, ignore_errors=True)
+    # Remove the recordings of processes that were killed while measuring; their names contain the PID.
+    for leftover in directory.glob(f"{_PREFIX}*.zarr"):
+        if not Path("/proc", leftover.stem.removeprefix(_PREFIX)).exists():
+            shutil.rmtree(leftover, ignore_errors=True)
     path = directory / f"{_PREFIX}{os.getpid()}.zarr"
     tagger = Tagger(trigger_run(load), load.stages, _CLOCK)
     flags = np.zeros(load.block_lines, np.uint16)
     with RecordingWriter.create(path, recording_spec(load, _CLOCK)) as writer:
 
         def append(k: int) -> int:
-            turn, arm = divmod(k, len(ARMS))
-            block = LineBlock(ARMS[arm], turn * load.block_lines, blocks[k % len(blocks)], flags)
-            writer.give_back(block.arm)  # as the recorder does in a hurry: the arms take turns
+            number, arm = divmod(k, len(ARMS))
+            block = LineBlock(ARMS[arm], number * load.block_lines, blocks[k % len(blocks)], flags)
+            writer.give_back(block.arm)  # as the recorder does when it is behind: the arms alternate
             writer.lend(tagger.tag(block))
             return load.block_lines
 

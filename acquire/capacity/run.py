@@ -1,4 +1,4 @@
-"""The whole capture path under a given load: real processes, ring, recorder, disk; cameras of stored lines.
+"""Run the whole capture path under a given load: real processes, ring, recorder and disk, with stored lines.
 
 ::
 
@@ -6,7 +6,7 @@
     pattern ─▶ camera in its grabber's process ─▶ ring ─┼─▶ recorder ─▶ recording, removed afterwards
     simulated trigger, here ─▶ tags ────────────────────┘
 
-Nothing is computed while it runs: what is measured is what a host needs for capture and recording alone.
+No lines are computed while it runs, so that only capture and recording are measured.
 """
 
 from __future__ import annotations
@@ -45,17 +45,17 @@ _GRACE_S = 30.0
 
 @dataclass(frozen=True, slots=True)
 class LoadReport:
-    """What came of a load. Latency is from a block's last line being due to its commit to the ring.
+    """Result of a load. Latency is the time from the trigger of a block's last line to its ring commit.
 
     Attributes
     ----------
-    lines, lost, unaccounted : of both arms: lines recorded; lost, whatever the cause; of neither kind
-    seconds : of recording, until the last line is on its way to the disk
-    ring_peak : the fuller ring's peak, as a part of it
+    lines, lost, unaccounted : lines of both arms that were recorded, lost for any cause, and neither
+    seconds : duration of the recording, until the last line is on its way to the disk
+    ring_peak : peak fill of the fuller ring, as a fraction
     cores : process → processor seconds per second: recorder, a, b, owner (with the simulated trigger)
     latency_ms : p50, p99, p99.9, max of the slower grabber
-    bytes_written : of chunks, as encoded
-    condition : the recording's
+    bytes_written : size of the encoded chunks
+    condition : condition of the recording
     """
 
     load: Load
@@ -71,7 +71,7 @@ class LoadReport:
 
     @property
     def clean(self) -> bool:
-        """Not a line lost."""
+        """True if no line was lost."""
         return not (self.lost or self.unaccounted) and self.condition is RunCondition.GOOD
 
     @property
@@ -82,7 +82,7 @@ class LoadReport:
 
 
 def run_load(load: Load, directory: Path, seconds: float) -> LoadReport:
-    """Record for ``seconds`` below ``directory``, which has nothing of it afterwards."""
+    """Record for ``seconds`` below ``directory``; the recording is removed afterwards."""
     path = directory / f".load-{time.time_ns():x}.zarr"
     wire = Wire()
     latencies = {arm: Latencies() for arm in ARMS}
@@ -103,8 +103,8 @@ def run_load(load: Load, directory: Path, seconds: float) -> LoadReport:
     finally:
         trigger.close()
         wire.close()
-        for one in latencies.values():
-            one.close()
+        for histogram in latencies.values():
+            histogram.close()
         shutil.rmtree(path, ignore_errors=True)
 
 
@@ -115,51 +115,55 @@ def _measure(
     capture.start(
         Begin(path, recording_spec(load, capture.clock), max(1, round(load.line_rate_hz * seconds)))
     )
-    for one in latencies.values():
-        one.clear()
+    for histogram in latencies.values():
+        histogram.clear()
     before, begun = _cpu_s(pids), time.monotonic()
-    while not (seen := capture.poll()).draining and not seen.done:
-        _check(seen, begun + seconds)
+    while not (status := capture.poll()).draining and not status.done:
+        _check(status, begun + seconds)
         time.sleep(_POLL_S)
     elapsed_s = time.monotonic() - begun
     cores = {name: (used - before[name]) / elapsed_s for name, used in _cpu_s(pids).items()}
-    while not (seen := capture.poll()).done:
-        _check(seen, begun + seconds)
+    while not (status := capture.poll()).done:
+        _check(status, begun + seconds)
         time.sleep(_POLL_S)
-    worst = max((one.percentiles_ms() for one in latencies.values()), key=lambda found: found["p99.9"])
-    # The books balance once nothing is under way any more, not before.
+    worst = max((each.percentiles_ms() for each in latencies.values()), key=lambda found: found["p99.9"])
+    # The ledger balances only once no line is on its way any more.
     capture.close()
-    seen = capture.poll()
-    assert seen.condition is not None
+    status = capture.poll()
+    assert status.condition is not None
     return LoadReport(
         load=load,
-        lines=sum(arm["recorded"] - arm["missing"] for arm in seen.lines.values()),
-        lost=sum(sum(arm["lost"].values()) for arm in seen.lines.values()),
-        unaccounted=sum(_unaccounted(arm) for arm in seen.lines.values()),
+        lines=sum(arm["recorded"] - arm["missing"] for arm in status.lines.values()),
+        lost=sum(sum(arm["lost"].values()) for arm in status.lines.values()),
+        unaccounted=sum(_unaccounted(arm) for arm in status.lines.values()),
         seconds=elapsed_s,
-        ring_peak=max(ring["peak"] / ring["slots"] for ring in seen.ring.values()),
+        ring_peak=max(ring["peak"] / ring["slots"] for ring in status.ring.values()),
         cores=cores,
         latency_ms=worst,
-        bytes_written=seen.ledger.get("store", {}).get("bytes_written", 0),
-        condition=seen.condition,
+        bytes_written=status.ledger.get("store", {}).get("bytes_written", 0),
+        condition=status.condition,
     )
 
 
-def _check(seen: CaptureStatus, ends_s: float) -> None:
-    if seen.fault is not None:
-        raise DataError(f"the load could not be held: {seen.fault}")
+def _check(status: CaptureStatus, ends_s: float) -> None:
+    """Raise DataError if the capture has a fault or the recording does not end in time."""
+    if status.fault is not None:
+        raise DataError(f"the load could not be sustained: {status.fault}")
     if time.monotonic() > ends_s + _GRACE_S:
-        raise DataError(f"the load's recording did not end within {_GRACE_S:g} s of its time")
+        raise DataError(f"the load's recording did not end within {_GRACE_S:g} s of its scheduled end")
 
 
 def _unaccounted(arm: dict[str, Any]) -> int:
-    """Lines that were delivered, and of which the books do not say what became of them."""
-    told = arm["preroll"] + arm["lost"]["ring_full"] + arm["discarded"] + arm["recorded"] - arm["missing"]
-    return abs(int(arm["delivered"] - told))
+    """Return the number of delivered lines for which the ledger does not account."""
+    known = arm["preroll"] + arm["lost"]["ring_full"] + arm["discarded"] + arm["recorded"] - arm["missing"]
+    return abs(int(arm["delivered"] - known))
 
 
 def capture_plan(load: Load, wire: Wire) -> CapturePlan:
-    """A run whose cameras show patterns at the pulses of ``wire``; its white level is that of the format."""
+    """Return the plan of a run whose cameras read out patterns at the pulses of ``wire``.
+
+    The white level is that of the pixel format.
+    """
     geometry = GeometryConfig(stages=load.stages, substeps=load.substeps)
     camera = CameraConfig(pixel_format=_PIXEL_FORMAT[load.dtype])
     openers: dict[str, CameraOpener] = {
@@ -189,15 +193,15 @@ def capture_plan(load: Load, wire: Wire) -> CapturePlan:
 
 
 def _cpu_s(pids: dict[str, int | None]) -> dict[str, float]:
-    """Processor seconds of processes (None: this one) and all their threads, ended ones too.
+    """Return the processor seconds of processes (None: this one), including threads that have ended.
 
-    Raises DataError where a process has ended, which none does in a load that is held.
+    Raises DataError if a process has ended, which does not happen if the load is sustained.
     """
     used_s = {}
     for name, pid in pids.items():
         try:
-            # The kernel's clock of another process's time, as clock_getcpuclockid(3) makes it.
+            # The kernel's clock id for another process's time, as computed by clock_getcpuclockid(3).
             used_s[name] = time.clock_gettime((~(pid or os.getpid()) << 3) | 2)
         except OSError as error:
-            raise DataError(f"the load could not be held: process {name} ended") from error
+            raise DataError(f"the load could not be sustained: process {name} ended") from error
     return used_s

@@ -1,4 +1,4 @@
-"""The highest line rate at which a load runs without a loss, by halving what is not known yet."""
+"""Find the highest line rate at which a load runs without loss, by bisection."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 RUN_S = 2.0
 NEAR = 1.08
-"""Ends when the lowest rate that failed is no more than so many times the highest that held."""
+"""The search ends when the lowest rate that failed is at most this multiple of the highest sustained one."""
 MOST_RUNS = 9
 _RING_GOOD = 0.5
 """A ring that was fuller than this would have overflowed in a longer run."""
@@ -25,7 +25,7 @@ _RING_GOOD = 0.5
 
 @dataclass(frozen=True, slots=True)
 class Trial:
-    """One run at one rate; ``report`` is None where the capture path could not go through with it."""
+    """One run at one rate; ``report`` is None if the capture path failed, and ``trouble`` is the reason."""
 
     line_rate_hz: float
     report: LoadReport | None
@@ -44,11 +44,14 @@ def search_rate(
     tell: Callable[[Trial], object] | None = None,
     most_runs: int = MOST_RUNS,
 ) -> list[Trial]:
-    """Every run in its order, from ``first_hz`` on; `best` picks the result."""
+    """Return all runs in order, of which the first is at ``first_hz``; `best` selects the result."""
     trials: list[Trial] = []
     good, bad, rate = 0.0, float("inf"), first_hz
     while len(trials) < most_runs and bad > good * NEAR:
-        trial = _try(replace(load, line_rate_hz=rate), directory, seconds)
+        try:
+            trial = Trial(rate, run_load(replace(load, line_rate_hz=rate), directory, seconds))
+        except (DataError, DeviceError) as error:
+            trial = Trial(rate, None, str(error))
         trials.append(trial)
         if tell is not None:
             tell(trial)
@@ -61,12 +64,5 @@ def search_rate(
 
 
 def best(trials: list[Trial]) -> Trial | None:
-    """The fastest that held, None where none did."""
+    """Return the fastest run that was sustained; None if none was."""
     return max((trial for trial in trials if trial.held), key=lambda trial: trial.line_rate_hz, default=None)
-
-
-def _try(load: Load, directory: Path, seconds: float) -> Trial:
-    try:
-        return Trial(load.line_rate_hz, run_load(load, directory, seconds))
-    except (DataError, DeviceError) as error:
-        return Trial(load.line_rate_hz, None, str(error))

@@ -1,4 +1,4 @@
-"""The instrument from a script: arm it, record, hear what happens, cut and reconstruct.
+"""The instrument from a script: arm it, record, follow events, cut and reconstruct.
 
 ::
 
@@ -13,8 +13,8 @@
             print(news.time, news.text)
         segment = client.open("run.zarr").cut(first_line, lines=263)
 
-`AsyncClient` has the same with `await`. Both speak the API that the daemon describes at /openapi.json and
-`acquire web` at /api/openapi.json.
+`AsyncClient` has the same methods with `await`. Both use the API that the daemon describes at /openapi.json
+and `acquire web` at /api/openapi.json.
 """
 
 from __future__ import annotations
@@ -33,5 +33,5 @@ if TYPE_CHECKING:
 
 __all__ = ["SEALED", "AsyncClient", "Client", "EventReader", "Health", "News", "Setup", "State", "Status"]
 
-# The command line, which asks once and leaves, is not to wait for asyncio.
+# Lazy, so that the command line, which makes one call and exits, does not import asyncio.
 __getattr__, __dir__ = lazily(__name__, {"AsyncClient": "asynchronous"}, __all__)

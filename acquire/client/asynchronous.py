@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 PATIENCE_S = 30.0
 RETRY_S = 0.1
 COMMAND_S = 600.0
-"""For the answer to a command: whoever waits for less cancels the call."""
+"""Longest wait for the answer to a command; cancel the call to wait for less."""
 _LEAVE_S = 1.0
 _READ_BYTES = 65536
 
@@ -33,10 +33,10 @@ T = TypeVar("T", bound=BaseModel)
 
 
 class AsyncClient:
-    """`Client` with `await`, for one event loop; many calls at a time, each with its own connection."""
+    """`Client` with `await`, for one event loop; concurrent calls each have their own connection."""
 
     def __init__(self, place: Path | str | None = None, *, token: str | None = None) -> None:
-        """As `Client`'s."""
+        """Take the same arguments as `Client`."""
         self._target = Target.of(place, token)
 
     def __repr__(self) -> str:
@@ -46,7 +46,7 @@ class AsyncClient:
         return self
 
     async def __aexit__(self, *_: object) -> None:
-        """A call has its own connection: nothing is left to be closed."""
+        """Do nothing: each call closes its own connection."""
 
     async def arm(
         self,
@@ -58,7 +58,7 @@ class AsyncClient:
         window: TriggerWindow | None = None,
         request_id: str | None = None,
     ) -> Status:
-        """idle → armed; the light follows ``code``."""
+        """Go from idle to armed; the light follows ``code``."""
         trigger = {"delays": delays, "window": window}
         how = {"force": force, "code": code, "calibration": calibration, **trigger}
         return await self.call(core.arm(request_id=request_id, **how))
@@ -74,7 +74,7 @@ class AsyncClient:
         resume: bool = False,
         request_id: str | None = None,
     ) -> Status:
-        """armed → recording."""
+        """Go from armed to recording."""
         budget = {
             "lines": lines,
             "duration_s": duration_s,
@@ -85,23 +85,23 @@ class AsyncClient:
         return await self.call(core.start(path, request_id, **budget))
 
     async def mark(self, text: str = "", *, request_id: str | None = None) -> Status:
-        """An event at the newest line."""
+        """Mark the newest line with an event."""
         return await self.call(core.mark(text, request_id))
 
     async def stop(self, *, request_id: str | None = None) -> Status:
-        """recording → armed: returns once the recording is sealed."""
+        """Go from recording to armed; return once the recording is sealed."""
         return await self.call(core.command("stop", Status, request_id=request_id))
 
     async def disarm(self, *, request_id: str | None = None) -> Status:
-        """armed → idle, or clears a fault."""
+        """Go from armed to idle, or clear a fault."""
         return await self.call(core.command("disarm", Status, request_id=request_id))
 
     async def measure(self) -> CapacityStatus:
-        """What ring, codec and disk sustain here, measured now; only while idle."""
+        """Measure what ring, codec and disk sustain on the daemon's host; only while idle."""
         return await self.call(core.command("capacity", CapacityStatus))
 
     async def reload(self) -> Reloaded:
-        """Have the daemon read its rig file anew; refused as a whole where a key cannot change meanwhile."""
+        """Let the daemon reload its rig file; all is refused if a changed key cannot take effect now."""
         return await self.call(core.command("reload", Reloaded))
 
     async def status(self) -> Status:
@@ -120,18 +120,18 @@ class AsyncClient:
         return await self.call(core.fact("rings", Rings))
 
     async def events(self, last_id: str | None = None, *, history: bool = False) -> AsyncIterator[News]:
-        """What happens, as it happens; a connection that breaks is made again, and nothing is missed.
+        """Yield news as it happens. A broken connection is made again, and no news is missed.
 
-        Raises NoDaemonError where the daemon is gone for longer than `PATIENCE_S`.
+        Raises NoDaemonError if the daemon is gone for longer than `PATIENCE_S`.
         """
         reader = EventReader(last_id)
         lost_s: float | None = None
         while True:
             try:
-                async for one in self.follow(reader, history=history):
+                async for item in self.follow(reader, history=history):
                     lost_s = None
-                    if isinstance(one, News):
-                        yield one
+                    if isinstance(item, News):
+                        yield item
             except NoDaemonError:
                 lost_s = lost_s or time.monotonic()
                 if time.monotonic() - lost_s > PATIENCE_S:
@@ -141,9 +141,9 @@ class AsyncClient:
     async def follow(
         self, reader: EventReader, *, history: bool = False, status_s: float | None = None
     ) -> AsyncIterator[News | Status | None]:
-        """News, and statuses where ``status_s`` asks for them, of one connection; None: no more for now.
+        """Yield the news of one connection, with a status every ``status_s``; None: no more for now.
 
-        Raises NoDaemonError when it breaks, or gives no sign of life for `core.SILENT_S`.
+        Raises NoDaemonError if the connection breaks, or is silent for `core.SILENT_S`.
         """
         reader.begin()
         path = core.events_path(self._target, history=history, status_s=status_s)
@@ -162,14 +162,14 @@ class AsyncClient:
                     core.fact("events", Status).read(status, rest, self._target)
                 *lines, rest = rest.split(b"\n")
                 if len(rest) > core.MOST_LINE_BYTES:
-                    raise NoDaemonError(f"the daemon on {self._target} tells news without an end")
+                    raise NoDaemonError(f"the daemon on {self._target} sends a line of news that is too long")
                 for line in lines:
-                    for one in reader.take(line.decode().rstrip("\r")):
-                        yield one
+                    for item in reader.take(line.decode().rstrip("\r")):
+                        yield item
         raise NoDaemonError(f"the daemon on {self._target} has ended")
 
     async def call(self, call: Call[T]) -> T:
-        """Carry a call out; a command whose connection breaks is sent once more, with the same id."""
+        """Make a call; a command whose connection breaks is sent once more, with the same id."""
         try:
             return await self._once(call)
         except NoDaemonError:
@@ -190,13 +190,13 @@ class AsyncClient:
                 else:
                     content += part
                 if len(content) > core.MOST_BYTES:
-                    raise NoDaemonError(f"the daemon on {self._target} answers without an end")
+                    raise NoDaemonError(f"the daemon on {self._target} sends an answer that is too long")
         return call.read(status, content, self._target)
 
     async def _exchange(
         self, method: str, path: str, headers: dict[str, str], body: bytes | None, limit_s: float
     ) -> AsyncGenerator[int | bytes, None]:
-        """The answer's status, then its content as it comes. ``limit_s`` bounds each wait."""
+        """Yield the answer's status, then its content as it arrives. ``limit_s`` bounds each wait."""
         reader, writer = await self._connect()
         http = h11.Connection(h11.CLIENT)
         sent = headers | ({"Content-Length": str(len(body))} if body else {})
@@ -220,10 +220,10 @@ class AsyncClient:
                     return
         except TimeoutError as error:
             raise NoDaemonError(
-                f"the daemon on {self._target} gave no answer within {limit_s:g} s"
+                f"the daemon on {self._target} did not answer within {limit_s:g} s"
             ) from error
         except (OSError, h11.RemoteProtocolError) as error:
-            raise NoDaemonError(f"the daemon on {self._target} went away") from error
+            raise NoDaemonError(f"the daemon on {self._target} has closed the connection") from error
         finally:
             await _close(writer)
 
@@ -238,11 +238,11 @@ class AsyncClient:
                 context = ssl.create_default_context() if target.tls else None
                 return await asyncio.open_connection(target.host, target.port, ssl=context)
         except OSError as error:
-            raise NoDaemonError(f"nobody answers on {target} ({error})", hint="acquire web") from error
+            raise NoDaemonError(f"no page answers at {target} ({error})", hint="acquire web") from error
 
 
 async def _close(writer: asyncio.StreamWriter) -> None:
-    """Close a connection; TLS takes leave first, and who does not answer that is not waited for."""
+    """Close a connection. TLS sends a notice first, whose answer is awaited only for a short time."""
     writer.close()
     try:
         async with asyncio.timeout(_LEAVE_S):

@@ -1,4 +1,4 @@
-"""The instrument seen from a script, call by call: see `acquire.client`."""
+"""The blocking client of the instrument; see `acquire.client`."""
 
 from __future__ import annotations
 
@@ -28,21 +28,21 @@ if TYPE_CHECKING:
     from acquire.store import Recording
 
 STARTING_TIMEOUT_S = 60.0
-"""For the socket of a daemon that is starting."""
+"""Longest wait for the socket of a daemon that is starting."""
 PROGRESS_S = 0.5
 POLL_S = 0.1
 PATIENCE_S = 30.0
-"""For a daemon whose stream of news has broken, before that is an error."""
+"""Longest time for which a broken stream of news is retried before it is an error."""
 
 T = TypeVar("T", bound=BaseModel)
 
 
 class Client:
-    """One daemon, by its socket or by the address of its page. Every call is bounded in time.
+    """One daemon, reached by its socket or by the address of its page. Every call is bounded in time.
 
-    A call has a connection of its own, and any thread may make one. A command whose connection breaks is sent
-    once more with the same request id, so that it is carried out once. Raises NoDaemonError where nobody
-    answers, and whatever the daemon refuses with, as the same class.
+    Each call has its own connection, and any thread may make one. A command whose connection breaks is sent
+    once more with the same request id, so that it is carried out only once. Raises NoDaemonError if no daemon
+    answers, and otherwise the daemon's own errors, as instances of the same classes.
     """
 
     def __init__(
@@ -52,15 +52,17 @@ class Client:
         *,
         token: str | None = None,
     ) -> None:
-        """``place``: the socket's path, the default one, or http://HOST:PORT with its ``token``
-        (or ACQUIRE_TOKEN). ``tell`` is called now and then with what is being waited for.
+        """Connect to nothing yet: each call makes its own connection.
+
+        ``place`` is the socket's path, None for the default one, or http://HOST:PORT with its ``token`` (or
+        ACQUIRE_TOKEN). ``tell`` is called now and then with the reason of a wait.
         """
         self._target = Target.of(place, token)
         self._tell = tell
 
     @property
     def path(self) -> Path | None:
-        """Of the socket; None where the daemon is asked by its page."""
+        """Path of the socket; None if the daemon is reached by its page."""
         return self._target.socket
 
     def __repr__(self) -> str:
@@ -70,7 +72,7 @@ class Client:
         return self
 
     def __exit__(self, *_: object) -> None:
-        """A call has its own connection: nothing is left to be closed."""
+        """Do nothing: each call closes its own connection."""
 
     # ---- commands
 
@@ -84,11 +86,12 @@ class Client:
         window: TriggerWindow | None = None,
         request_id: str | None = None,
     ) -> Status:
-        """idle → armed: cameras and trigger run, nothing is written. ``force``: however slow the host.
+        """Go from idle to armed: cameras and trigger run, and nothing is written.
 
-        ``code``: what the light follows; ``"dark"`` is off and ``"steady"`` on, as calibration needs it.
-        ``calibration="none"``: recordings get no copy of the one that the rig names. ``delays``: of light and
-        cameras, ``window``: of the light in each lit sub-step, both in place of the rig's.
+        ``force`` arms even if the host is too slow. ``code`` is what the light follows: the rig's code,
+        ``"dark"`` for off or ``"steady"`` for on, as calibration needs it. With ``calibration="none"``,
+        recordings get no copy of the rig's calibration. ``delays`` of light and cameras and the ``window`` of
+        the light in each lit sub-step replace those of the rig.
         """
         trigger = {"delays": delays, "window": window}
         how = {"force": force, "code": code, "calibration": calibration, **trigger}
@@ -105,11 +108,11 @@ class Client:
         resume: bool = False,
         request_id: str | None = None,
     ) -> Status:
-        """armed → recording. A relative ``path`` is meant from the caller's directory.
+        """Go from armed to recording. A relative ``path`` is relative to the caller's directory.
 
-        ``pre_s`` of the recording are from before the request, as far as the ring holds them; ``post_s`` is
-        another way to say how long it is to go on. With ``resume``, ``path`` is a sealed recording that goes
-        on in a segment beside it.
+        ``pre_s`` seconds of the recording are from before the request, as far as the ring holds them;
+        ``post_s`` is the time from the request to its end. With ``resume``, ``path`` is a sealed recording
+        that continues in a segment next to it.
         """
         budget = {
             "lines": lines,
@@ -121,51 +124,51 @@ class Client:
         return self._do(core.start(path, request_id, **budget))
 
     def mark(self, text: str = "", *, request_id: str | None = None) -> Status:
-        """An event at the newest line; it starts a recording where the rig's ``[events]`` say so."""
+        """Mark the newest line with an event, which starts a recording if the rig's ``[events]`` allow it."""
         return self._do(core.mark(text, request_id))
 
     def stop(self, *, request_id: str | None = None) -> Status:
-        """recording → armed: returns once the recording is sealed."""
+        """Go from recording to armed; return once the recording is sealed."""
         return self._do(core.command("stop", Status, request_id=request_id))
 
     def disarm(self, *, request_id: str | None = None) -> Status:
-        """armed → idle, or clears a fault."""
+        """Go from armed to idle, or clear a fault."""
         return self._do(core.command("disarm", Status, request_id=request_id))
 
     def measure(self) -> CapacityStatus:
-        """What ring, codec and disk sustain here, measured now; only while idle."""
+        """Measure what ring, codec and disk sustain on the daemon's host; only while idle."""
         return self._do(core.command("capacity", CapacityStatus))
 
     def reload(self) -> Reloaded:
-        """Have the daemon read its rig file anew; refused as a whole where a key cannot change meanwhile."""
+        """Let the daemon reload its rig file; all is refused if a changed key cannot take effect now."""
         return self._do(core.command("reload", Reloaded))
 
     # ---- facts
 
     def status(self) -> Status:
-        """What the daemon is doing; answered at once, whatever it is busy with."""
+        """Return what the daemon is doing; it answers at once, even if it is busy."""
         return self._do(core.fact("status", Status))
 
     def health(self) -> Health:
-        """Is all well? One word, one sentence, and what they follow from."""
+        """Return whether all is well: a level, a sentence, and the checks behind them."""
         return self._do(core.fact("health", Health))
 
     def version(self) -> Version:
-        """Who answers."""
+        """Return the version and the process of the daemon."""
         return self._do(core.fact("version", Version))
 
     def setup(self) -> Setup:
-        """The resolved configuration, and where it is not the default."""
+        """Return the complete configuration, and where it differs from the defaults."""
         return self._do(core.fact("setup", Setup))
 
     def rings(self) -> Rings:
-        """The memory through which the lines pass, for `acquire.stream.peek` on the same host."""
+        """Return the shared memory of the rings, for `acquire.stream.peek` on the same host."""
         return self._do(core.fact("rings", Rings))
 
     def open(self, path: Path | str | None = None) -> Recording:
-        """A recording, on this host: the one at ``path``, the one being written, or the latest.
+        """Open a recording on this host: the one at ``path``, the one being written, or the latest.
 
-        Raises StateError where there is none.
+        Raises StateError if there is none.
         """
         from acquire.store import open_recording
 
@@ -173,21 +176,22 @@ class Client:
             status = self.status()
             latest = status.recording or status.last
             if latest is None:
-                raise StateError("nothing has been recorded since the daemon began", hint="client.start()")
+                raise StateError("nothing has been recorded since the daemon started", hint="client.start()")
             path = latest.path
         return open_recording(path)
 
     def wait(self, states: Collection[State], timeout_s: float) -> Status:
-        """The status once the daemon is in one of ``states``.
+        """Wait until the daemon is in one of ``states``, and return its status.
 
-        Raises StateError when the time is up, and at once when a fault keeps the daemon from getting there.
+        Raises StateError when the time is up, and at once if a fault keeps the daemon from getting there.
         """
         deadline = time.monotonic() + timeout_s
         while (status := self.status()).state not in states:
             wanted = " or ".join(states)
             if status.state is State.FAULTED:
                 raise StateError(
-                    f"waiting for {wanted}, but the daemon is faulted: {status.fault}", hint="acquire disarm"
+                    f"the daemon cannot become {wanted}, because it is faulted: {status.fault}",
+                    hint="acquire disarm",
                 )
             if time.monotonic() >= deadline:
                 staying = status.state is State.ARMED and State.IDLE in states
@@ -205,22 +209,22 @@ class Client:
     def events(
         self, last_id: str | None = None, *, history: bool = False, timeout_s: float | None = None
     ) -> Iterator[News]:
-        """What happens, as it happens; ends ``timeout_s`` after the daemon has told what it knows, or never.
+        """Yield news as it happens, until ``timeout_s`` after the known news, or forever.
 
-        Begins after the news ``last_id``, with all that is known (``history``), or with what comes; however
-        slow the host, that is told whole. It ends with the next sign of life, which comes each second. A
-        connection that breaks is made again, and what happened meanwhile comes first. Raises NoDaemonError
-        where the daemon is gone for longer than `PATIENCE_S`.
+        It starts after the news ``last_id``, with all news that the daemon still has (``history``), or with
+        the next. The known news are always complete, however slow the host, and the time ends with the next
+        sign of life, which comes every second. A broken connection is made again, and the news from in
+        between come first. Raises NoDaemonError if the daemon is gone for longer than `PATIENCE_S`.
         """
         reader = EventReader(last_id)
         end_s: float | None = None
         lost_s: float | None = None
         while end_s is None or time.monotonic() < end_s:
             try:
-                for one in self._follow(reader, history=history):
+                for item in self._follow(reader, history=history):
                     lost_s = None
-                    if isinstance(one, News):
-                        yield one
+                    if isinstance(item, News):
+                        yield item
                     elif end_s is None and timeout_s is not None:
                         end_s = time.monotonic() + timeout_s
                     if end_s is not None and time.monotonic() >= end_s:
@@ -232,7 +236,7 @@ class Client:
                 time.sleep(POLL_S)
 
     def _follow(self, reader: EventReader, *, history: bool) -> Iterator[News | Status | None]:
-        """One connection's worth of news. Raises NoDaemonError when it breaks."""
+        """Yield the news of one connection. Raises NoDaemonError when it breaks."""
         reader.begin()
         with self._connection(core.SILENT_S) as connection:
             path = core.events_path(self._target, history=history, status_s=None)
@@ -246,10 +250,12 @@ class Client:
                 while line := response.readline(core.MOST_LINE_BYTES):
                     yield from reader.take(line.decode().rstrip("\r\n"))
             except (OSError, http.client.HTTPException) as error:
-                raise NoDaemonError(f"the daemon on {self._target} went away while it told news") from error
+                raise NoDaemonError(
+                    f"the daemon on {self._target} has closed the connection while it was sending news"
+                ) from error
         raise NoDaemonError(f"the daemon on {self._target} has ended")
 
-    # ---- the way there
+    # ---- the connection
 
     def _do(self, call: Call[T]) -> T:
         try:
@@ -257,8 +263,8 @@ class Client:
         except _BrokenError:
             if call.request_id is None:
                 raise
-        # Once more, under the same id: if the first one arrived, this gets its answer and nothing is done
-        # twice. A third would only keep a caller waiting whose daemon is gone.
+        # Once more, with the same id: if the first request arrived, this one gets its answer, and nothing is
+        # done twice. A third attempt would only delay the error if the daemon is gone.
         return self._once(call)
 
     def _once(self, call: Call[T]) -> T:
@@ -266,17 +272,19 @@ class Client:
             try:
                 path = self._target.path(call.name)
                 connection.request(call.method, path, call.content, call.headers(self._target))
-                # No fixed time is right for a command, since arming may take a minute: the daemon is asked.
+                # No fixed time suits a command, since arming may take a minute: the daemon's status decides.
                 if call.method == "POST" and connection.sock is not None:
                     self._await_answer(connection.sock, call.timeout_s)
                 response = connection.getresponse()
                 return call.read(response.status, _content(response), self._target)
             except TimeoutError as error:
                 raise NoDaemonError(
-                    f"the daemon on {self._target} gave no answer to {call.name} within {call.timeout_s:g} s"
+                    f"the daemon on {self._target} did not answer {call.name} within {call.timeout_s:g} s"
                 ) from error
             except (OSError, http.client.HTTPException) as error:
-                raise _BrokenError(f"the daemon on {self._target} went away during {call.name}") from error
+                raise _BrokenError(
+                    f"the daemon on {self._target} has closed the connection during {call.name}"
+                ) from error
 
     @contextlib.contextmanager
     def _connection(self, timeout_s: float) -> Iterator[http.client.HTTPConnection]:
@@ -289,7 +297,7 @@ class Client:
             connection.close()
 
     def _connect(self) -> socket.socket:
-        """To the daemon, or to one that is only starting, once it listens."""
+        """Connect to the daemon, after waiting for it if it is starting."""
         path = self._target.socket
         if path is None:
             return connect_to_page(self._target)
@@ -300,13 +308,13 @@ class Client:
             except NoDaemonError:
                 if time.monotonic() > deadline:
                     raise
-                if not is_one_starting(path):  # or it listens by now, and does not start any more
+                if not is_one_starting(path):  # there is none, or it has begun to listen in the meantime
                     return connect(path, core.CONNECT_TIMEOUT_S)
-            self._tell(f"waiting for a daemon on {path}: one is starting")
+            self._tell(f"waiting for the daemon on {path}, which is starting")
             time.sleep(POLL_S)
 
     def _await_answer(self, connection: socket.socket, timeout_s: float) -> None:
-        """As long as the daemon is at work; TimeoutError when it has nothing under way for so long."""
+        """Wait for an answer while the daemon is busy; TimeoutError if it is not busy for ``timeout_s``."""
         answered = select.poll()
         answered.register(connection, select.POLLIN)
         deadline = time.monotonic() + timeout_s
@@ -314,7 +322,7 @@ class Client:
             try:
                 status = self.status()
             except NoDaemonError:
-                return  # it has gone, or hangs: so says the connection
+                return  # it is gone or hangs, which the connection will show
             if status.busy is not None or status.state is State.DRAINING:
                 self._tell(status.busy or str(status.state))
                 deadline = time.monotonic() + timeout_s
@@ -323,11 +331,11 @@ class Client:
 
 
 class _BrokenError(NoDaemonError):
-    """The connection broke after the request was sent: whether it was carried out is not known."""
+    """The connection broke after the request was sent, so that it may or may not have been carried out."""
 
 
 def _content(response: http.client.HTTPResponse) -> bytes:
-    """All of it. Raises IncompleteRead where it broke off, which a bounded read hides."""
+    """Return the whole content. Raises IncompleteRead if it is truncated, which a bounded read would hide."""
     content = response.read(core.MOST_BYTES)
     if response.length:
         raise http.client.IncompleteRead(content, response.length)
@@ -335,11 +343,11 @@ def _content(response: http.client.HTTPResponse) -> bytes:
 
 
 def connect_to_page(target: Target) -> socket.socket:
-    """Raises NoDaemonError where no page is served there, or its certificate is not believed."""
+    """Connect to a page. Raises NoDaemonError if none is served there, or its certificate is not trusted."""
     try:
         plain = socket.create_connection((target.host, target.port), core.CONNECT_TIMEOUT_S)
         if not target.tls:
             return plain
         return ssl.create_default_context().wrap_socket(plain, server_hostname=target.host)
     except OSError as error:
-        raise NoDaemonError(f"nobody answers on {target} ({error})", hint="acquire web") from error
+        raise NoDaemonError(f"no page answers at {target} ({error})", hint="acquire web") from error

@@ -1,4 +1,4 @@
-"""What both clients have in common, without a byte of input or output: calls, answers, the stream of news.
+"""The parts shared by both clients, without input or output: calls, answers and the stream of news.
 
 ::
 
@@ -33,23 +33,23 @@ from acquire.place import default_socket
 from acquire.text import shortened
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator
+    from collections.abc import Iterator
 
 CONNECT_TIMEOUT_S = 5.0
 STATUS_TIMEOUT_S = 10.0
 COMMAND_TIMEOUT_S = 30.0
-"""For the answer to a command when the daemon says that it does nothing; while it works, it is waited for."""
+"""Longest wait for the answer to a command while the daemon is not busy; while it is, the wait continues."""
 MOST_BYTES = 2**24
-"""Of an answer."""
+"""Longest answer."""
 MOST_LINE_BYTES = 2**20
-"""Of a line of the stream of news."""
+"""Longest line of the stream of news."""
 SILENT_S = 5.0
-"""A stream of news without a sign of life for so long has broken."""
+"""Silence after which a stream of news counts as broken."""
 TOKEN_VARIABLE = "ACQUIRE_TOKEN"  # noqa: S105 - the name of a variable
 API = "/api"
-"""Where the API lies in what `acquire web` serves; the daemon serves nothing else."""
+"""Prefix of the API in what `acquire web` serves; the daemon serves it without a prefix."""
 BAD = 400
-"""The first HTTP status that is an error."""
+"""Lowest HTTP status that is an error."""
 
 T = TypeVar("T", bound=BaseModel)
 R = TypeVar("R", bound=BaseModel)
@@ -57,7 +57,7 @@ R = TypeVar("R", bound=BaseModel)
 
 @dataclass(frozen=True, slots=True)
 class Target:
-    """Who is asked: a Unix socket, or a server with its token."""
+    """The peer of a call: a Unix socket, or a server with its token."""
 
     socket: Path | None = None
     host: str = "acquire"
@@ -67,7 +67,7 @@ class Target:
 
     @classmethod
     def of(cls, place: Path | str | None, token: str | None = None) -> Target:
-        """``place``: a socket's path, a URL, or None for the default socket."""
+        """Return the target for a socket's path, a URL, or None for the default socket."""
         text = "" if place is None else str(place)
         if not text.startswith(("http://", "https://")):
             return cls(socket=default_socket() if place is None else Path(place).absolute())
@@ -78,7 +78,7 @@ class Target:
             port = 0
         if not (parts.hostname and port) or parts.path.strip("/") or parts.query:
             raise UsageError(
-                f"{text} is no address of acquire", possible="http://HOST:PORT, or a socket's path"
+                f"{text} is not a valid address", possible="http://HOST:PORT, or a socket's path"
             )
         tls = parts.scheme == "https"
         token = token or os.environ.get(TOKEN_VARIABLE)
@@ -93,15 +93,15 @@ class Target:
         return f"/{below}" if self.socket is not None else f"{API}/{below}"
 
     def headers(self) -> dict[str, str]:
-        """With the name that it is asked for by, which a page insists on."""
+        """Return the headers of every request: the host name, which a page checks, and the token."""
         host = f"[{self.host}]" if ":" in self.host else self.host
-        named = {"Host": host if self.socket is not None else f"{host}:{self.port}"}
-        return named | ({"Authorization": f"Bearer {self.token}"} if self.token else {})
+        headers = {"Host": host if self.socket is not None else f"{host}:{self.port}"}
+        return headers | ({"Authorization": f"Bearer {self.token}"} if self.token else {})
 
 
 @dataclass(frozen=True, slots=True)
 class Call(Generic[T]):
-    """One request, and what its answer is."""
+    """One request, and the model of its answer."""
 
     method: str
     name: str
@@ -125,26 +125,26 @@ class Call(Generic[T]):
         return headers
 
     def read(self, status: int, content: bytes, target: Target) -> T:
-        """The answer. Raises the error that it is, or AcquireError for what this version does not know."""
+        """Decode the answer. Raises the daemon's error, or AcquireError for an answer of another version."""
         try:
             if status < BAD:
                 return self.answer.model_validate_json(content)
             raise ErrorMessage.model_validate_json(content).rebuild()
         except ValidationError as error:
             raise AcquireError(
-                f"{self.name}: the daemon on {target} speaks another version of this program (HTTP {status})"
+                f"{self.name}: the daemon on {target} runs another version of this program (HTTP {status})"
             ) from error
 
 
 def fact(name: str, answer: type[T]) -> Call[T]:
-    """A question that is answered at once."""
+    """Return a call for information, which the daemon answers at once."""
     return Call("GET", name, answer, timeout_s=STATUS_TIMEOUT_S)
 
 
 def command(
     name: str, answer: type[T], body: BaseModel | None = None, request_id: str | None = None
 ) -> Call[T]:
-    """A command; without an id of the caller's it gets one, so that it can be sent again."""
+    """Return a command; it gets a request id unless the caller has one, so that it can be sent again."""
     return Call("POST", name, answer, body, request_id=request_id or secrets.token_hex(16))
 
 
@@ -153,7 +153,7 @@ def arm(*, request_id: str | None, **how: Any) -> Call[Status]:
 
 
 def start(path: Path | str | None, request_id: str | None, **budget: Any) -> Call[Status]:
-    """A relative ``path`` is meant from the caller's directory."""
+    """Return the command; a relative ``path`` is relative to the caller's directory."""
     absolute = None if path is None else Path(path).absolute()
     return command("start", Status, request("start", StartRequest, path=absolute, **budget), request_id)
 
@@ -163,7 +163,7 @@ def mark(text: str, request_id: str | None) -> Call[Status]:
 
 
 def request(command: str, model: type[R], **fields: Any) -> R:
-    """What a command asks for; refused here already where it is impossible as asked."""
+    """Return the body of a command. Raises UsageError for invalid values, before anything is sent."""
     try:
         return model(**fields)
     except ValidationError as error:
@@ -186,9 +186,9 @@ def events_headers(target: Target, last_id: str | None) -> dict[str, str]:
 
 
 class EventReader:
-    """Lines of the stream in, `News` and `Status` out; keeps the id to go on with.
+    """Decodes lines of the stream to `News` and `Status`, and keeps the id from which to continue.
 
-    It outlives the connection: `begin` each one, so that what the last broke off in is not read on with.
+    It outlives its connections: call `begin` for each, to discard the incomplete event of a broken one.
     """
 
     def __init__(self, last_id: str | None = None) -> None:
@@ -196,11 +196,11 @@ class EventReader:
         self.begin()
 
     def begin(self) -> None:
-        """A connection begins: half an event that an earlier one ended with is told again, whole."""
+        """Start a connection; an event that was cut off by the end of the last one is sent again."""
         self._event = self._data = ""
 
     def take(self, line: str) -> Iterator[News | Status | None]:
-        """The next line, without its end; what is complete with it. None: nothing more to tell for now."""
+        """Take the next line, without its end, and yield what it completes; None: no more for now."""
         name, _, value = line.partition(":")
         value = value.removeprefix(" ")
         if line.startswith(":"):
@@ -212,16 +212,15 @@ class EventReader:
         elif not line and self._data:
             event, data = self._event, self._data
             self.begin()
-            yield from self._told(event, data)
-
-    def _told(self, event: str, data: str) -> Iterable[News | Status]:
-        try:
-            if event == "status":
-                return [Status.model_validate_json(data)]
-            if event != "news":
-                return []  # of a later version
-            news = News.model_validate_json(data)
-        except ValidationError as error:
-            raise AcquireError("the daemon tells news as another version of this program does") from error
-        self.last_id = news.id
-        return [news]
+            if event not in ("status", "news"):
+                return  # an event of a later version
+            item: News | Status
+            try:
+                item = (Status if event == "status" else News).model_validate_json(data)
+            except ValidationError as error:
+                raise AcquireError(
+                    "the daemon runs another version of this program: its news cannot be read"
+                ) from error
+            if isinstance(item, News):
+                self.last_id = item.id
+            yield item

@@ -1,16 +1,16 @@
-"""Models of the files in ``configs/``: what a rig is, what a scene shows, what a plan asks for.
+"""Models of the files in ``configs/``: rigs, scenes and reconstruction plans.
 
-Unknown keys are refused. An error names the file, the key, what stood there and what is allowed. A file per
-table of a rig file, a file for all that a scene file may hold::
+Unknown keys are refused. An error names the file, the key, its value and what is allowed. There is one module
+per table of a rig file, and one for the contents of a scene file::
 
     files                                   paths, names and overrides -> validated models
     rig                                     a whole instrument
-    device event recording service web      its tables
-    scene plan                              what simulated cameras see · what a reconstruction combines
-    effect                                  what all effects have in common
-    findings schema                         what is to be mended, in words · JSON schemas for editors
-    variants                                tables of an installed class
-    base                                    what all models refuse
+    device event fibre recording service web      its tables
+    scene plan                              scenes of simulated cameras · plans of reconstructions
+    effect                                  the base of all effects
+    findings schema                         error messages · JSON schemas for editors
+    variants                                tables whose model is a plug-in's class
+    base                                    the base of all models
 """
 
 from acquire.config.files import (

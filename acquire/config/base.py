@@ -1,4 +1,4 @@
-"""What all configuration models have in common: what they refuse, and the bounds of reason."""
+"""The base of all configuration models: what they refuse, and the bounds of plausible values."""
 
 from __future__ import annotations
 
@@ -8,18 +8,19 @@ from typing import Annotated, Any
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 MOST_CHARACTERS = 4096
-"""Of any text in a file: a path, a URL, a name."""
+"""Longest text in a file, such as a path, a URL or a name."""
 MOST_SECONDS = 1e9
-"""Thirty years; a longer time is a slip of the finger."""
+"""Thirty years; a longer time is a typing error."""
 MOST_DN = 1e9
 MOST_LINES = 2**53
 SEED_END = 2**128
-"""Seeds go into every recording, as JSON."""
+"""Upper bound of seeds, which are stored in every recording as JSON."""
 
 
 class FrozenModel(BaseModel):
-    """Unknown keys and non-finite numbers are refused, and so are values of another type: ``true`` is no
-    number, ``"64"`` and ``64.0`` are no counts. Values do not change.
+    """An immutable model that refuses unknown keys, non-finite numbers and values of another type.
+
+    ``true`` is not accepted as a number, nor ``"64"`` or ``64.0`` as a count.
     """
 
     model_config = ConfigDict(
@@ -29,7 +30,7 @@ class FrozenModel(BaseModel):
     @model_validator(mode="before")
     @classmethod
     def _lists_are_tuples(cls, table: Any) -> Any:
-        """A file's lists, and their lists, are what cannot change here."""
+        """Turn a file's lists, and the lists in them, into tuples, since the model is immutable."""
         if not isinstance(table, dict):
             return table
         return {key: _tuples(value) if isinstance(value, list) else value for key, value in table.items()}
@@ -40,8 +41,8 @@ def _tuples(items: list[Any]) -> tuple[Any, ...]:
 
 
 FilePath = Annotated[Path, Field(strict=False)]
-"""A path; files write it as text."""
+"""A path, written as text in files."""
 Seconds = Annotated[float, Field(ge=0, le=MOST_SECONDS)]
-"""A duration, within reason."""
+"""A duration of plausible length."""
 Positive = Annotated[float, Field(gt=0)]
 Part = Annotated[float, Field(ge=0, le=1)]

@@ -1,4 +1,4 @@
-"""Models of a rig's ``[trigger]`` and ``[cameras]``: what its devices are and how they are set."""
+"""Models of a rig's ``[trigger]`` and ``[cameras]``: its devices and their settings."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ PIXEL_BITS = {"Mono8": 8, "Mono10": 10, "Mono12": 12, "Mono16": 16}
 
 
 GentlModule = Literal["remote", "interface", "device", "stream", "system"]
-"""Where a camera's features are: in the camera itself, or in a module of the host's side."""
+"""The module that has a feature: the camera itself ("remote"), or a module on the host's side."""
 
 
 class LineOutputConfig(FrozenModel):
@@ -25,23 +25,31 @@ class LineOutputConfig(FrozenModel):
     enable: bool = True
     delay_ticks: int = Field(default=0, ge=0, lt=2**24, description="from the line's start to the pulse")
     width_ticks: int | None = Field(
-        default=None, ge=1, lt=2**24, description="absent: a third of the distance of pulses, at most 90"
+        default=None, ge=1, lt=2**24, description="absent: a third of the pulse period, at most 90"
     )
     active: Literal["high", "low"] = "high"
     direction: Literal["forward", "reverse"] = "forward"
-    strobe: bool = Field(default=False, description="the camera answers every pulse: count those it misses")
+    strobe: bool = Field(
+        default=False, description="the camera answers every pulse, so that missed pulses can be counted"
+    )
 
 
 class LightOutputConfig(FrozenModel):
     """The LED output: code bit AND window AND scene gate."""
 
     enable: bool = True
-    lead_ticks: int = Field(default=0, ge=0, le=255, description="by which light precedes its sub-step")
-    open_ticks: int = Field(default=0, ge=0, lt=2**24, description="of a sub-step, from which light may be")
-    close_ticks: int | None = Field(
-        default=None, ge=1, lt=2**24, description="from which it may not; absent: the sub-step's end"
+    lead_ticks: int = Field(
+        default=0, ge=0, le=255, description="ticks by which the light precedes its sub-step"
     )
-    scene_gate: bool = Field(default=False, description="only while the scene gate input allows it")
+    open_ticks: int = Field(
+        default=0, ge=0, lt=2**24, description="tick of a sub-step at which the light may go on"
+    )
+    close_ticks: int | None = Field(
+        default=None, ge=1, lt=2**24, description="tick at which it must be off; absent: the sub-step's end"
+    )
+    scene_gate: bool = Field(
+        default=False, description="true: the light is on only while the scene gate input allows it"
+    )
     active: Literal["high", "low"] = "high"
 
 
@@ -54,12 +62,12 @@ class TriggerConfig(FrozenModel):
         "`acquire plugins` lists",
     )
     options: Annotated[FrozenModel | None, OptionsOf(TRIGGERS)] = Field(
-        default=None, validate_default=True, description="of the driver's own"
+        default=None, validate_default=True, description="options of the driver"
     )
     url: str = Field(default="", description="driver 'serial': /dev/tty…, socket://host:port")
     baud: int = Field(default=3_000_000, ge=9600, le=10**9, description="driver 'serial'")
     flow_control: Literal["none", "rts-cts"] = Field(
-        default="none", description="driver 'serial'; 'rts-cts' where the board wires both lines"
+        default="none", description="driver 'serial'; 'rts-cts' if the board has both lines wired"
     )
     serial: str = Field(default="", description="driver 'usb': serial number; absent: any")
     clock_hz: int = Field(default=90_000_000, ge=1_000_000, le=1_000_000_000)
@@ -69,7 +77,7 @@ class TriggerConfig(FrozenModel):
         default="per-line", description="when the cameras are triggered"
     )
     camera_min_period_ticks: int = Field(
-        default=0, ge=0, lt=2**32, description="closest pulses that the cameras stand; 0: any"
+        default=0, ge=0, lt=2**32, description="shortest pulse period that the cameras accept; 0: any"
     )
     line_budget: int = Field(
         default=0, ge=0, lt=2**48, description="lines after which a run ends; 0: endless"
@@ -78,7 +86,7 @@ class TriggerConfig(FrozenModel):
         default=10.0,
         ge=0,
         le=3600,
-        description="of silence of the host after which the trigger ends the run and puts the light out; "
+        description="silence of the host after which the trigger ends the run and switches the light off; "
         "0: never. At most 2^32 ticks, 47 s at 90 MHz",
     )
     external_start: Literal["off", "rising", "falling"] = "off"
@@ -89,25 +97,25 @@ class TriggerConfig(FrozenModel):
 
     @property
     def watchdog_ticks(self) -> int:
-        """What the trigger counts: ``watchdog_s``, rounded up."""
+        """``watchdog_s`` in ticks of the trigger, rounded up."""
         return math.ceil(self.watchdog_s * self.clock_hz)
 
     @property
     def settled_s(self) -> dict[str, float]:
-        """Arm → by how much its line starts after the light of the line's first sub-step is let on (s)."""
+        """Arm → delay (s) of a line's start after the light of its first sub-step goes on."""
         ticks = {"a": self.a.delay_ticks, "b": self.b.delay_ticks}
         return {arm: (self.light.lead_ticks + delay) / self.clock_hz for arm, delay in ticks.items()}
 
     @property
     def lit_part(self) -> tuple[float, float]:
-        """From where to where of a lit sub-step the light is on, as parts of it."""
+        """Begin and end of the light within a lit sub-step, as fractions of it."""
         closes = self.substep_ticks if self.light.close_ticks is None else self.light.close_ticks
         return self.light.open_ticks / self.substep_ticks, closes / self.substep_ticks
 
     @model_validator(mode="before")
     @classmethod
-    def _ticks_of_old(cls, table: Any) -> Any:
-        """Recordings of before have the watchdog in ticks, 0 as a rule: their rig still reads as it was."""
+    def _convert_watchdog_ticks(cls, table: Any) -> Any:
+        """Convert the watchdog of older recordings, which is in ticks, so that their rig stays readable."""
         if not isinstance(table, dict) or "watchdog_ticks" not in table or "watchdog_s" in table:
             return table
         ticks, clock_hz = table["watchdog_ticks"], table.get("clock_hz", cls.model_fields["clock_hz"].default)
@@ -118,7 +126,7 @@ class TriggerConfig(FrozenModel):
     @model_validator(mode="after")
     def _port_known(self) -> TriggerConfig:
         if self.driver == "serial" and not self.url:
-            raise ValueError("driver 'serial' needs a url: /dev/ttyUSB0, socket://host:port")
+            raise ValueError("driver 'serial' needs a url, such as /dev/ttyUSB0 or socket://host:port")
         return self
 
 
@@ -129,14 +137,14 @@ class CameraConfig(FrozenModel):
         default="simulated",
         description="'harvesters': through the maker's GenTL producer; 'aravis': GigE and USB3 Vision; "
         "'gentl-simulated', 'gige-simulated': simulated cameras through either; "
-        "'pattern': stored lines in place of the scene, at any rate, for loads; or one that "
+        "'pattern': stored lines in place of the scene, at any rate, for load tests; or one that "
         "`acquire plugins` lists",
     )
     options: Annotated[FrozenModel | None, OptionsOf(CAMERAS)] = Field(
-        default=None, validate_default=True, description="of the driver's own"
+        default=None, validate_default=True, description="options of the driver"
     )
     serial: str = "simulated"
-    model: str = Field(default="", description="what the camera must be; absent: any")
+    model: str = Field(default="", description="model that the camera must be; absent: any")
     cti: str = Field(
         default="",
         description="GenTL producer; absent: those of GENICAM_GENTL64_PATH. 'aravis': the camera's address",
@@ -146,16 +154,20 @@ class CameraConfig(FrozenModel):
         description="[module, feature, value] in the order in which they are written; 'aravis': module "
         "'stream' has frame-retention, packet-timeout, packet-resend and other parameters of its stream",
     )
-    buffer_s: float = Field(default=0.5, ge=0.2, le=60, description="lines that the driver can hold")
-    first_column: int = Field(
-        default=0, ge=0, le=2**16, description="layout 'compact': where the arm's image begins"
+    buffer_s: float = Field(
+        default=0.5, ge=0.2, le=60, description="lines that the driver can buffer, in seconds"
     )
-    frame_id_bits: int = Field(default=0, ge=0, le=64, description="0: found when the ids wrap")
+    first_column: int = Field(
+        default=0, ge=0, le=2**16, description="layout 'compact': first column of the arm's image"
+    )
+    frame_id_bits: int = Field(
+        default=0, ge=0, le=64, description="bits of a frame id; 0: detected when the ids wrap around"
+    )
     frame_id_first: Literal[0, 1] | None = Field(
-        default=None, description="of the first frame; absent: whichever comes first"
+        default=None, description="id of the first frame; absent: that of the first to arrive"
     )
     pixel_format: Literal["Mono8", "Mono10", "Mono12", "Mono16"] = "Mono12"
-    black_level_dn: float = Field(default=0.0, ge=0, le=MOST_DN, description="of a pixel without light")
+    black_level_dn: float = Field(default=0.0, ge=0, le=MOST_DN, description="value of a pixel without light")
     responsivity_dn: float = Field(
         default=1.0, gt=0, le=MOST_DN, description="DN per unit of scene light and sub-step"
     )
@@ -163,21 +175,21 @@ class CameraConfig(FrozenModel):
         default=None,
         gt=0,
         le=MOST_DN,
-        description="system gain K of EMVA 1288, where it is known and no calibration says it",
+        description="system gain K of EMVA 1288, if it is known and not in a calibration",
     )
     read_noise_e: float | None = Field(
-        default=None, ge=0, le=MOST_DN, description="temporal dark noise of EMVA 1288, likewise"
+        default=None, ge=0, le=MOST_DN, description="temporal dark noise of EMVA 1288, if it is known"
     )
 
     @model_validator(mode="after")
     def _noise_whole(self) -> CameraConfig:
         if (self.dn_per_electron is None) != (self.read_noise_e is None):
-            raise ValueError("dn_per_electron and read_noise_e belong together: both, or neither")
+            raise ValueError("dn_per_electron and read_noise_e must be given together, or not at all")
         return self
 
     @property
     def noise_facts(self) -> dict[str, float]:
-        """What a recording is told of the camera's noise; nothing where nothing is known."""
+        """The camera's noise, as stored in recordings; empty if it is not known."""
         if self.dn_per_electron is None or self.read_noise_e is None:
             return {}
         return {"dn_per_electron": self.dn_per_electron, "read_noise_e": self.read_noise_e}
@@ -197,7 +209,7 @@ class CameraConfig(FrozenModel):
 
 
 class CamerasConfig(FrozenModel):
-    """The camera of either arm; or one that has both, opened as table a says: of b only the image counts."""
+    """The cameras of both arms. One camera for both is opened as table a says; only the image is b's own."""
 
     layout: Literal["dual", "compact", "fibre"] = Field(
         default="dual",
@@ -214,10 +226,10 @@ class CamerasConfig(FrozenModel):
     def _alike(self) -> CamerasConfig:
         if self.a.pixel_format != self.b.pixel_format:
             raise ValueError(
-                f"both arms need one pixel_format, not {self.a.pixel_format} and {self.b.pixel_format}"
+                f"both arms need the same pixel_format, not {self.a.pixel_format} and {self.b.pixel_format}"
             )
         if self.layout == "compact" and (self.a.serial, self.a.driver) != (self.b.serial, self.b.driver):
-            raise ValueError("layout 'compact' is one camera: both arms need its serial and driver")
+            raise ValueError("layout 'compact' has one camera, so both arms need the same serial and driver")
         if (
             self.layout != "compact"
             and self.a.serial == self.b.serial

@@ -1,4 +1,4 @@
-"""What the models of all effects have in common. Each stands with its stages, in `acquire.sim.effects`."""
+"""The base of the models of effects, which are defined with their stages in `acquire.sim.effects`."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Models of a rig's ``[events]`` and ``[check]``: what is looked for in the lines while they pass."""
+"""Models of a rig's ``[events]`` and ``[check]``: what is detected in the lines during capture."""
 
 from __future__ import annotations
 
@@ -10,29 +10,30 @@ from acquire.config.base import MOST_DN, FrozenModel, Seconds
 
 
 class EventsConfig(FrozenModel):
-    """While armed, an event of one of ``sources`` starts a recording; while that is written, it prolongs it.
+    """While armed, an event from one of ``sources`` starts a recording; further events prolong it.
 
-    The level is the mean of the arm's pixels over some lines. It counts as crossed once, until it has gone
-    back by the hysteresis.
+    The level is compared with the mean of the arm's pixels over some lines. A crossing counts once, until the
+    mean has gone back by the hysteresis.
     """
 
     sources: tuple[Literal["mark", "input", "threshold"], ...] = Field(
         default=(),
-        description="'mark': acquire mark; 'input': an edge at the trigger's PPS input; 'threshold': level",
+        description="'mark': acquire mark; 'input': an edge at the trigger's PPS input; 'threshold': the "
+        "mean of the pixels crosses level_dn",
     )
-    arm: Literal["a", "b"] = Field(default="a", description="'threshold': whose lines")
+    arm: Literal["a", "b"] = Field(default="a", description="'threshold': the arm to observe")
     level_dn: float = Field(default=0.0, ge=0, le=MOST_DN, description="'threshold': mean of the pixels")
     hysteresis_dn: float = Field(
-        default=0.0, ge=0, le=MOST_DN, description="by which it must go back to count again"
+        default=0.0, ge=0, le=MOST_DN, description="amount by which the mean must go back to count again"
     )
     edge: Literal["rising", "falling"] = "rising"
-    average_lines: int = Field(default=64, ge=1, le=65536, description="lines that the mean is taken over")
-    pre_s: Seconds = Field(default=0.0, description="recorded from before the event, as the ring has it")
-    post_s: Seconds = Field(default=1.0, gt=0, description="recorded after the last event")
+    average_lines: int = Field(default=64, ge=1, le=65536, description="lines over which the mean is taken")
+    pre_s: Seconds = Field(default=0.0, description="time recorded before the event, taken from the ring")
+    post_s: Seconds = Field(default=1.0, gt=0, description="time recorded after the last event")
     rearm: bool = Field(
         default=False,
-        description="every event starts a recording, and the instrument stays armed for the next; "
-        "false: only the first event since it was armed",
+        description="true: every event starts a recording, and the instrument stays armed for the next; "
+        "false: only the first event after arming does",
     )
 
     @model_validator(mode="after")
@@ -43,12 +44,16 @@ class EventsConfig(FrozenModel):
 
 
 class CheckConfig(FrozenModel):
-    """Whether the light follows the code, by the lines themselves. Lines in doubt are flagged, never dropped.
+    """Check from the lines themselves that the light follows the code. Doubtful lines are flagged, and kept.
 
-    Each arm's pixels predict the other's energy, so that the arms are checked against each other to the
-    sub-step. Images known to lie off one another by some fine pixels are told here.
+    The pixels of each arm predict the energy of the other, so that the arms are checked against each other to
+    the sub-step. A known offset between the images, in fine pixels, is entered here.
     """
 
     enable: bool = True
-    registration_a: int = Field(default=0, ge=-64, le=64, description="sub-steps by which arm a shows late")
-    registration_b: int = Field(default=0, ge=-64, le=64, description="sub-steps by which arm b shows late")
+    registration_a: int = Field(
+        default=0, ge=-64, le=64, description="sub-steps by which the image of arm a is late"
+    )
+    registration_b: int = Field(
+        default=0, ge=-64, le=64, description="sub-steps by which the image of arm b is late"
+    )

@@ -26,38 +26,38 @@ if TYPE_CHECKING:
     from acquire.config.scene import SceneBase
 
 MOST_FILE_BYTES = 2**20
-"""Of a file of this kind; written by hand, they have some kilobytes."""
+"""Largest configuration file; files written by hand have some kilobytes."""
 
 M = TypeVar("M", bound=BaseModel)
 
 
 _MARKS = {"rig": {"geometry", "cameras", "trigger"}, "scene": {"kind"}, "plan": {"segments"}}
-"""Keys by which a file shows what it describes."""
+"""Keys from which the kind of a file is recognised."""
 _USES = {
     "rig": "acquire serve --config {0}, or acquire simulate SCENE --config {0}",
     "scene": "acquire simulate {0} --out NAME.zarr",
     "plan": "acquire reconstruct RECORDING --plan {0} --out VIDEO.zarr",
 }
-"""The command that takes a file, by what it describes."""
+"""The commands that take a file of each kind."""
 
 
 def find(name: str | Path, beside: Path | None = None, kind: str = "") -> Path:
-    """The file ``name``: as a path, beside another file, or a built-in one (with or without .toml).
+    """Return the file ``name``: a path, a file next to ``beside``, or a built-in one (.toml may be omitted).
 
-    ``kind``, one of rig, scene and plan, chooses the built-in files that an error lists.
+    ``kind``, one of rig, scene and plan, selects the built-in files that an error lists.
     """
     candidates = [Path(name)]
     if beside is not None:
         candidates.append(beside.parent / name)
     candidates += [builtin_directory() / name, builtin_directory() / f"{name}.toml"]
     for path in candidates:
-        if os.path.isfile(path):  # noqa: PTH113  # Path's raises for a name that no file can have
+        if os.path.isfile(path):  # noqa: PTH113  # Path.is_file raises for names that no file can have
             return path
     have = ", ".join(builtin_names(kind))
     if name and os.path.isdir(name):  # noqa: PTH112
         why = "is a directory"
     else:
-        why = "is no regular file" if os.path.lexists(name) else "does not exist"
+        why = "is not a regular file" if os.path.lexists(name) else "does not exist"
     what = f"{kind} file" if kind else "configuration file"
     near = did_you_mean(str(name), builtin_names(kind))
     raise ConfigError(
@@ -68,10 +68,10 @@ def find(name: str | Path, beside: Path | None = None, kind: str = "") -> Path:
 def load_rig(
     name: str | Path, overrides: Mapping[str, Any] | None = None, scene: str | None = None
 ) -> RigConfig:
-    """Read, override (dotted keys, as ``{"simulation.speed": 10}``) and validate a rig file.
+    """Read, override (with dotted keys, as in ``{"simulation.speed": 10}``) and validate a rig file.
 
-    Relative paths of scenes and calibrations are resolved against the file. ``scene`` is what simulated
-    cameras see where the file does not say.
+    Relative paths of scenes and calibrations are resolved against the file. ``scene`` is the scene of
+    simulated cameras if the file names none.
     """
     path = find(name, kind="rig")
     table = _read(path)
@@ -80,18 +80,19 @@ def load_rig(
         _set(table, key, value)
     rig = _validate(RigConfig, table, path)
     if (named := rig.calibration) is not None:
-        # From here on, as on a command line, or else from where the file is.
-        place = named if os.path.lexists(named) else path.parent / named
-        rig = rig.model_copy(update={"calibration": place.resolve()})
+        # Relative to the working directory, as on a command line, or else to the file.
+        calibration = named if os.path.lexists(named) else path.parent / named
+        rig = rig.model_copy(update={"calibration": calibration.resolve()})
     if not rig.needs_scene:
         return rig
     scene = scene if scene is not None and rig.simulation.scene is None else rig.scene_file()
-    seen = find(scene, beside=path, kind="scene").resolve()
-    return rig.model_copy(update={"simulation": rig.simulation.model_copy(update={"scene": str(seen)})})
+    scene_path = find(scene, beside=path, kind="scene").resolve()
+    simulation = rig.simulation.model_copy(update={"scene": str(scene_path)})
+    return rig.model_copy(update={"simulation": simulation})
 
 
 def check_directory(rig: RigConfig) -> None:
-    """Raise ConfigError unless the directory for recordings is there."""
+    """Raise ConfigError unless the directory for recordings exists."""
     directory = rig.recording.directory
     if not directory.is_dir():
         raise ConfigError(f"recording.directory: there is no directory {directory}", hint="create it first")
@@ -102,7 +103,7 @@ _QUOTABLE = re.compile(r"[^'\x00-\x1f]{1,200}")
 
 
 def parse_settings(settings: Sequence[str]) -> dict[str, Any]:
-    """``["code.seed=7", "name='x'"]`` as overrides of `load_rig`; values are TOML."""
+    """Return settings such as ``["code.seed=7", "name='x'"]`` as overrides of `load_rig`; values are TOML."""
     overrides = {}
     for setting in settings:
         key, equals, value = setting.partition("=")
@@ -111,9 +112,9 @@ def parse_settings(settings: Sequence[str]) -> dict[str, Any]:
         try:
             overrides[key.strip()] = tomllib.loads(f"value = {value}")["value"]
         except (ValueError, RecursionError) as error:
-            quoted = f"""text needs quotes of its own: "{key}='{value}'" """.rstrip()
+            quoted = f"""put text in quotes: "{key}='{value}'" """.rstrip()
             raise ConfigError(
-                f"setting {shown(setting)} holds no TOML value: {shortened(error)}",
+                f"setting {shown(setting)} has no valid TOML value: {shortened(error)}",
                 possible=_SETTINGS,
                 hint=quoted if _QUOTABLE.fullmatch(value) else "",
             ) from error
@@ -121,7 +122,7 @@ def parse_settings(settings: Sequence[str]) -> dict[str, Any]:
 
 
 def load_scene(name: str | Path) -> SceneBase:
-    """Read and validate a scene file; a picture or video file is a scene that shows it.
+    """Read and validate a scene file; a picture or video file becomes a scene that shows it.
 
     Relative paths in it are resolved against the file.
     """
@@ -135,9 +136,9 @@ def load_scene(name: str | Path) -> SceneBase:
 
 
 def load_recorded(attrs: Mapping[str, Any], origin: str | Path) -> tuple[RigConfig, SceneBase]:
-    """The rig and the scene that a recording was simulated with; ``origin`` is what errors name.
+    """Return the rig and the scene that a recording was simulated with; errors name ``origin``.
 
-    Raises ConfigError where a plug-in that made them is not installed here.
+    Raises ConfigError if they need a plug-in that is not installed here.
     """
     where = f"{origin}, as it was recorded"
     return _validate(RigConfig, attrs["config"], where), _validate(SceneFile, attrs["scene"], where).root
@@ -152,32 +153,32 @@ def load_plan(name: str | Path) -> ReconstructionPlan:
 
 
 def check_plan(table: dict[str, Any], origin: str | Path) -> ReconstructionPlan:
-    """The plan that a table describes; ``origin`` is where its mistakes are to be mended."""
+    """Return the plan that a table describes; errors name ``origin``."""
     return _validate(ReconstructionPlan, table, Path(origin))
 
 
 def _read(path: Path) -> dict[str, Any]:
     try:
-        # Editors of some systems begin a file with a mark.
+        # utf-8-sig: some editors begin a file with a byte order mark.
         text = read_regular(path, MOST_FILE_BYTES).decode("utf-8-sig")
         return tomllib.loads(text)
     except UnicodeDecodeError as error:
         raise ConfigError(f"{path} is not TOML: byte {error.start} is not UTF-8") from error
     except RecursionError as error:
         raise ConfigError(f"{path} is not TOML: it is nested too deeply") from error
-    except ValueError as error:  # that of a number with thousands of digits, too
+    except ValueError as error:  # also raised for a number with thousands of digits
         raise ConfigError(f"{path} is not TOML: {shortened(error, 400)}") from error
     except OSError as error:
         raise ConfigError(f"{path} cannot be read: {error.strerror}") from error
 
 
 def _check_kind(table: dict[str, Any], wanted: str, path: Path) -> None:
-    """Raise ConfigError for a file that shows that it describes something else than what is ``wanted``."""
-    # Only where it is clear: of a table that could be either, pydantic says what is wrong with it.
+    """Raise ConfigError for a file that clearly describes something other than ``wanted``."""
+    # In unclear cases the file is validated, and pydantic reports what is wrong with it.
     found = [kind for kind, keys in _MARKS.items() if keys & table.keys()]
     if len(found) == 1 and found != [wanted]:
         raise ConfigError(
-            f"{path} describes a {found[0]}, and a {wanted} was asked for",
+            f"{path} describes a {found[0]}, but a {wanted} is needed here",
             possible=f"a {wanted} file",
             hint=_USES[found[0]].format(path.stem if path.parent == builtin_directory() else path),
         )
@@ -188,7 +189,7 @@ def _set(table: dict[str, Any], dotted: str, value: Any) -> None:
     for key in parents:
         table = table.setdefault(key, {})
         if not isinstance(table, dict):
-            raise ConfigError(f"setting {dotted!r}: {key!r} is a value, nothing is below it")
+            raise ConfigError(f"setting {dotted!r} cannot be set: {key!r} is a value and not a table")
     table[last] = value
 
 

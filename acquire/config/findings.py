@@ -1,4 +1,4 @@
-"""What is to be mended in a file: pydantic's findings in the words of the file that they are about."""
+"""Error messages for configuration files: pydantic's findings in terms of the file's own keys."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ if TYPE_CHECKING:
 
 _GROUPS = {group.name: group for group in GROUPS}
 MOST_LISTED = 20
-"""Things to mend that one error lists."""
+"""Largest number of findings that one error lists."""
 
 
 def explained(error: ValidationError, model: type[BaseModel], path: Path | str) -> str:
-    """Every finding on a line: its key, what stands there, why it cannot, and what is allowed."""
-    lines = [f"{path}: {error.error_count()} thing(s) to mend"]
-    found = error.errors()
-    for item in found[:MOST_LISTED]:
+    """Return one line per finding, with its key, its value, the reason and what is allowed."""
+    lines = [f"{path}: {error.error_count()} error(s)"]
+    findings = error.errors()
+    for item in findings[:MOST_LISTED]:
         keys, allowed = _locate(model, item["loc"])
         key = shortened(".".join(keys)) or "(file)"
         why = shortened(item["msg"].removeprefix("Value error, "), 400)
@@ -34,16 +34,16 @@ def explained(error: ValidationError, model: type[BaseModel], path: Path | str) 
             lines.append(f"  {key}: {why}")
         else:
             lines.append(f"  {key} = {shown(item['input'])}: {why}")
-    if len(found) > MOST_LISTED:
-        lines.append(f"  and {len(found) - MOST_LISTED} more")
+    if len(findings) > MOST_LISTED:
+        lines.append(f"  and {len(findings) - MOST_LISTED} more")
     return "\n".join(lines)
 
 
 def _locate(model: type[BaseModel], location: tuple[int | str, ...]) -> tuple[list[str], list[str]]:
-    """The key as the file writes it, and the keys allowed beside it.
+    """Return the key as it is in the file, and the keys allowed next to it.
 
-    pydantic's location also holds the tags of unions and groups, which no file contains: the schema tells
-    them apart.
+    pydantic's location also contains the tags of unions and groups, which are not in the file. The schema
+    distinguishes them from keys.
     """
     schema = model.model_json_schema()
     node: dict[str, Any] = schema

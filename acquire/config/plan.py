@@ -4,7 +4,7 @@
 
     fade_substeps = 48
 
-    [[segments]]                 # one after the other, from the beginning of what is reconstructed
+    [[segments]]                 # one after another, from the beginning of the reconstructed range
     name = "A"
     substeps = 2136              # or lines = 712, or seconds = 1.187e-3
     spatial_merge = 3
@@ -12,7 +12,7 @@
 
     [[segments]]
     name = "B"
-    spatial_merge = 1            # the last may leave its length open: all that is left
+    spatial_merge = 1            # the last may omit its length and takes the rest
     temporal_merge = 230
 """
 
@@ -25,11 +25,11 @@ from pydantic import Field, model_validator
 from acquire.config.base import MOST_LINES, FrozenModel, Seconds
 
 FADE_SUBSTEPS = 32
-"""To either side of a seam: over this, one sub-segment becomes the next."""
+"""Sub-steps on either side of a seam over which one sub-segment fades into the next."""
 
 
 class SegmentPlan(FrozenModel):
-    """One sub-segment: how long it is, and its voxels."""
+    """One sub-segment: its length and its voxels."""
 
     name: str = ""
     substeps: int | None = Field(default=None, ge=1, le=MOST_LINES)
@@ -37,30 +37,30 @@ class SegmentPlan(FrozenModel):
     seconds: Seconds | None = Field(default=None, gt=0)
     spatial_merge: int = Field(ge=1, le=2**16, description="N_m, side of a voxel in fine pixels")
     temporal_merge: int = Field(ge=1, le=2**40, description="T_m, sub-steps of a voxel")
-    why: str = Field(default="", description="for people; `--auto` says here what it saw")
+    why: str = Field(default="", description="a comment; `--auto` states its reasons here")
 
     @model_validator(mode="after")
     def _one_length(self) -> SegmentPlan:
         given = [key for key in ("substeps", "lines", "seconds") if getattr(self, key) is not None]
         if len(given) > 1:
             raise ValueError(
-                f"{' and '.join(given)} exclude each other; possible: one of substeps, lines and seconds"
+                f"{' and '.join(given)} exclude each other; possible: one of substeps, lines or seconds"
             )
         return self
 
     @property
     def is_open(self) -> bool:
-        """All that is left."""
+        """True if no length is given: the sub-segment then takes the rest."""
         return self.substeps is None and self.lines is None and self.seconds is None
 
     @property
     def length(self) -> str:
-        """For people."""
+        """The length as text."""
         given = (("lines", self.lines), ("sub-steps", self.substeps), ("s", self.seconds))
         return next((f"{value:g} {unit}" for unit, value in given if value is not None), "the rest")
 
     def length_substeps(self, substeps_per_line: int, substep_s: float) -> int | None:
-        """Its length, to whole sub-steps; None where it is open."""
+        """Return the length in whole sub-steps; None if it is open."""
         if self.lines is not None:
             return self.lines * substeps_per_line
         return self.substeps if self.seconds is None else max(1, round(self.seconds / substep_s))
@@ -71,7 +71,8 @@ class ReconstructionPlan(FrozenModel):
 
     title: str = ""
     ends: Literal["trusted", "whole"] = Field(
-        default="trusted", description="whole: also what the first and the last lines sample in part"
+        default="trusted",
+        description="'whole': also the frames that the first and the last lines sample only in part",
     )
     fade_substeps: int = Field(default=FADE_SUBSTEPS, ge=0, le=1_000_000)
     segments: tuple[SegmentPlan, ...] = Field(min_length=1)
@@ -81,5 +82,5 @@ class ReconstructionPlan(FrozenModel):
         names = [segment.name or f"segment {i}" for i, segment in enumerate(self.segments[:-1])]
         still_open = [name for name, segment in zip(names, self.segments, strict=False) if segment.is_open]
         if still_open:
-            raise ValueError(f"{', '.join(still_open)}: only the last segment may leave its length open")
+            raise ValueError(f"{', '.join(still_open)} must have a length: only the last segment may omit it")
         return self

@@ -1,4 +1,4 @@
-"""What a rig is: geometry, code, capture path and what its parts have in common."""
+"""Model of a rig: geometry, code, capture path, and the constraints between its tables."""
 
 from __future__ import annotations
 
@@ -25,19 +25,19 @@ if TYPE_CHECKING:
     from acquire.fibre import Fibre
 
 RING_RESERVE_SHARE = 4
-"""Of the ring's slots, one part in so many stays free for the cameras while a recording takes the past."""
+"""One in this many ring slots stays free for the cameras while a recording reads the past."""
 EVENT_DELAY_S = 0.5
-"""Between an event and the recording that it starts."""
+"""Time between an event and the recording that it starts."""
 WHOLE_STEPS = ("VT-4K5C-H100",)
-"""Models of cameras that are known to have no intra-line charge transfer."""
+"""Camera models that are known to have no intra-line charge transfer."""
 MAX_RING_BYTES = 4 * 2**30
-"""Pixels that may wait in the ring of one arm."""
+"""Largest ring of one arm."""
 
 
 class GeometryConfig(FrozenModel):
-    """The sensor as the model sees it."""
+    """The sensor in the forward model."""
 
-    stages: int = Field(ge=1, le=4096, description="M, TDI stages; also pixels per line, but behind a fibre")
+    stages: int = Field(ge=1, le=4096, description="M, TDI stages; without a fibre also the pixels per line")
     substeps: int = Field(ge=1, le=8, description="S, charge-transfer steps per line")
 
     def segment(self, lines: int) -> Geometry:
@@ -50,17 +50,17 @@ class PrbsConfig(FrozenModel):
     kind: Literal["prbs"] = "prbs"
     degree: int = Field(default=64, description="degree of the register: " + ", ".join(map(str, TAPS)))
     seed: int = Field(
-        default=1, ge=0, lt=SEED_END, description="any number; the register's first state is mixed from it"
+        default=1, ge=0, lt=SEED_END, description="any number; the register's first state is derived from it"
     )
     state: str | None = Field(
         default=None,
         pattern="^0x[0-9a-f]+$",
-        description="the register's first state itself, instead of a seed",
+        description="the register's first state, instead of a seed",
     )
 
     @model_validator(mode="after")
     def _degree_known(self) -> PrbsConfig:
-        if self.degree not in TAPS:  # of others, no taps are known here that make the longest sequence
+        if self.degree not in TAPS:  # taps of a maximal-length sequence are known only for these degrees
             raise ValueError(f"degree {self.degree} is not one of {', '.join(map(str, TAPS))}")
         return self
 
@@ -89,14 +89,16 @@ class StreamConfig(FrozenModel):
         default=None,
         gt=0,
         le=MOST_SECONDS,
-        description="of lines from the past that the ring holds, instead of ring_slots",
+        description="past lines that the ring holds, in seconds, instead of ring_slots",
     )
-    reopen_s: float = Field(default=2.0, ge=0, le=600, description="wait for a camera that is gone")
+    reopen_s: float = Field(
+        default=2.0, ge=0, le=600, description="longest wait for a camera that is gone to come back"
+    )
     stall_s: float = Field(
         default=3.0,
         gt=0,
         le=600,
-        description="an arm that is silent for longer has stalled, unless its camera is waited for longer",
+        description="silence after which an arm has stalled, unless reopen_s grants its camera more time",
     )
     arm_timeout_s: float = Field(
         default=120.0,
@@ -106,64 +108,64 @@ class StreamConfig(FrozenModel):
     )
     realtime: bool = Field(
         default=False,
-        description="grabbers before everything else on the host, where its user may (RLIMIT_RTPRIO); "
-        "not for simulated cameras, which compute",
+        description="true: grabbers take precedence over everything else on the host, if the user may do so "
+        "(RLIMIT_RTPRIO); not for simulated cameras, which compute",
     )
 
 
 class ControlConfig(FrozenModel):
-    """Where the daemon listens."""
+    """The socket on which the daemon listens."""
 
     socket: FilePath = Field(default_factory=default_socket)
 
 
 class SimulationConfig(FrozenModel):
-    """What simulated devices see, and how fast their time runs."""
+    """The scene of simulated devices, and the speed of their time."""
 
     scene: str | None = Field(
         default=None,
-        description="what simulated cameras see: a scene file, beside this file or a built-in one; absent "
-        "where no camera is simulated",
+        description="scene before simulated cameras: a scene file next to this file, or a built-in one; "
+        "absent if no camera is simulated",
     )
     speed: float = Field(default=1.0, gt=0, le=1000, description="simulated seconds per second")
     replay: FilePath | None = Field(
-        default=None, description="a recording whose lines the cameras give instead"
+        default=None, description="a recording whose lines the cameras replay instead of a scene"
     )
-    replay_loop: bool = Field(default=False, description="over and over")
+    replay_loop: bool = Field(default=False, description="true: repeat the recording endlessly")
     replay_gate: FilePath | None = Field(
-        default=None, description="a file; before it exists, no replayed line comes"
+        default=None, description="a file; no replayed line comes before it exists"
     )
 
 
-def _prbs_unless_said(value: Any) -> Any:
-    """``[code]`` without a ``kind`` is pseudo-random, as the rig without ``[code]`` is."""
+def _default_to_prbs(value: Any) -> Any:
+    """Make ``[code]`` without a ``kind`` pseudo-random, as it is in a rig without ``[code]``."""
     return {"kind": "prbs", **value} if isinstance(value, dict) else value
 
 
 class RigConfig(FrozenModel):
-    """A whole instrument: everything the daemon needs to know."""
+    """A whole instrument: everything that the daemon needs."""
 
     name: str = Field(
         pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*$",
         max_length=128,
-        description="recordings and the list of those to upload are named after it",
+        description="name after which recordings and the list of pending uploads are named",
     )
     geometry: GeometryConfig
     code: Annotated[
-        PrbsConfig | ConstantCodeConfig, Field(discriminator="kind"), BeforeValidator(_prbs_unless_said)
+        PrbsConfig | ConstantCodeConfig, Field(discriminator="kind"), BeforeValidator(_default_to_prbs)
     ] = PrbsConfig()
     trigger: TriggerConfig = Field(default_factory=TriggerConfig)
     cameras: CamerasConfig
     fibre: FibreConfig | None = Field(
-        default=None, description="layout 'fibre': how the bands of a larger scene lie on the sensors"
+        default=None, description="layout 'fibre': positions of the bands of a larger scene on the sensors"
     )
     stream: StreamConfig = StreamConfig()
     recording: RecordingConfig = RecordingConfig()
     events: EventsConfig = EventsConfig()
     calibration: FilePath | None = Field(
         default=None,
-        description="of this instrument, as `acquire calibrate` makes one: a path, also beside this file; "
-        "every recording gets a copy",
+        description="calibration of this instrument, made with `acquire calibrate`: a path, which may be "
+        "relative to this file; every recording gets a copy",
     )
     check: CheckConfig = CheckConfig()
     control: ControlConfig = Field(default_factory=ControlConfig)
@@ -173,32 +175,33 @@ class RigConfig(FrozenModel):
     web: WebConfig | None = Field(default=None, description="absent: the daemon starts no page")
 
     @model_validator(mode="after")
-    def _fibre_meant(self) -> RigConfig:
-        """Before the ring, which holds lines as wide as the sensor behind a fibre."""
-        laid = self.cameras.layout == "fibre"
-        if self.fibre is None and laid:
+    def _fibre_matches_layout(self) -> RigConfig:
+        """Checked before the ring, whose lines are as wide as the sensor behind a fibre."""
+        has_layout = self.cameras.layout == "fibre"
+        if self.fibre is None and has_layout:
             raise ValueError("cameras.layout = 'fibre' needs [fibre] with rows, columns and sensor_pixels")
-        if self.fibre is not None and not laid:
+        if self.fibre is not None and not has_layout:
             raise ValueError(
-                f"[fibre] goes with another cameras.layout than {self.cameras.layout!r}; possible: 'fibre'"
+                f"[fibre] cannot be used with cameras.layout = {self.cameras.layout!r}; possible: 'fibre'"
             )
         try:
-            self.laid_out  # noqa: B018  # what cannot be is refused when it is built
+            self.laid_out  # noqa: B018  # building it raises UsageError for an impossible fibre
         except UsageError as error:
             raise ValueError(str(error)) from error
         return self
 
     @model_validator(mode="after")
     def _ring_fits(self) -> RigConfig:
-        """Lines wait for their tag in the ring, and no longer once half of it is full: a sixth is for a tag
-        that comes late on a busy host.
+        """Lines wait in the ring for their tag until half of it is full.
+
+        Tags every third of the ring leave a sixth of it for a tag that is late on a busy host.
         """
         lines = self.ring_slots * self.stream.block_lines
         pixel_bytes = 1 if self.cameras.a.dtype == "uint8" else 2
         if (size := lines * self.pixels * pixel_bytes) > MAX_RING_BYTES:
             raise ValueError(
                 f"stream.{self._ring_keys} = {lines} lines of {self.pixels} pixels "
-                f"are {size} bytes of memory per arm; possible: up to {MAX_RING_BYTES}"
+                f"need {size} bytes of memory per arm; possible: up to {MAX_RING_BYTES}"
             )
         if self.trigger.tag_every_lines > lines // 3:
             raise ValueError(
@@ -208,31 +211,31 @@ class RigConfig(FrozenModel):
         return self
 
     @model_validator(mode="after")
-    def _stages_meant(self) -> RigConfig:
-        """What a camera is set to, where that is known, has to be what the model is told."""
+    def _geometry_matches_cameras(self) -> RigConfig:
+        """The geometry must agree with the cameras' settings, as far as these are known."""
         for arm, camera in (("a", self.cameras.a), ("b", self.cameras.b)):
             for _, feature, value in camera.settings:
                 if feature == "TDIStages" and value != f"TDI{self.geometry.stages}":
                     raise ValueError(
-                        f"cameras.{arm}.settings: TDIStages is {value!r}, and geometry.stages is "
+                        f"cameras.{arm}.settings: TDIStages is {value!r}, but geometry.stages is "
                         f"{self.geometry.stages}; possible: TDI{self.geometry.stages}"
                     )
             if self.geometry.substeps > 1 and camera.model in WHOLE_STEPS:
                 raise ValueError(
-                    f"geometry.substeps = {self.geometry.substeps} does not go with cameras.{arm}.model = "
-                    f"{camera.model!r}, which moves its charge once a line; possible: substeps = 1, and as "
-                    "many stages as it has TDI stages; acquire cut --merge makes intra-line lines of those"
+                    f"geometry.substeps = {self.geometry.substeps} cannot be used with cameras.{arm}.model = "
+                    f"{camera.model!r}, which moves its charge once per line; possible: substeps = 1, with "
+                    "stages set to its TDI stages; acquire cut --merge then makes intra-line lines"
                 )
         return self
 
     @model_validator(mode="after")
     def _past_fits(self) -> RigConfig:
-        """An event is noticed, and its recording created, while the ring goes on."""
+        """The ring keeps filling while an event is detected and its recording is created."""
         longest_s = self.history_s - EVENT_DELAY_S * self.simulation.speed
         if self.events.sources and self.events.pre_s > longest_s:
             raise ValueError(
                 f"events.pre_s cannot be {self.events.pre_s:g}; possible: up to {max(0.0, longest_s):.3g}, "
-                f"since the ring holds {self.history_s:.3g} s; a longer one: stream.ring_seconds"
+                f"since the ring holds {self.history_s:.3g} s; stream.ring_seconds makes it longer"
             )
         return self
 
@@ -246,40 +249,40 @@ class RigConfig(FrozenModel):
 
     @property
     def simulates_cameras(self) -> bool:
-        """Whether the trigger's pulses go to a camera that is simulated."""
+        """True if any camera is simulated."""
         return any(CAMERAS.load(camera.driver).simulated for camera in (self.cameras.a, self.cameras.b))
 
     @property
     def needs_scene(self) -> bool:
-        """Whether an arm's lines are computed from what its camera sees."""
+        """True if the lines of an arm are computed from a scene."""
         return self.simulation.replay is None and any(
             CAMERAS.load(camera.driver).sees_scene for camera in (self.cameras.a, self.cameras.b)
         )
 
     def scene_file(self) -> str:
-        """What simulated cameras see. Raises ConfigError where nothing is said of it."""
+        """Return the scene of simulated cameras. Raises ConfigError if the rig names none."""
         if self.simulation.scene is None:
             raise ConfigError(
-                f"rig {self.name}: simulation.scene is missing, which simulated cameras see",
+                f"rig {self.name} has simulated cameras, and simulation.scene is missing",
                 possible=f"a scene file, a picture or a video, or one of {', '.join(builtin_names('scene'))}",
-                hint='simulation.scene = "scene-leds", or cameras of another driver',
+                hint='set simulation.scene = "scene-leds", or choose cameras with another driver',
             )
         return self.simulation.scene
 
     @property
     def laid_out(self) -> Fibre | None:
-        """Layout 'fibre': which column sees what; None in the others."""
+        """The fibre of layout 'fibre', which maps the scene to columns; None in the other layouts."""
         sizes = self.geometry
         return None if self.fibre is None else self.fibre.build(sizes.stages, sizes.substeps)
 
     @property
     def pixels(self) -> int:
-        """Of a line of one arm: as many as there are stages, or as the sensors behind a fibre are wide."""
+        """Pixels of one arm's line: the number of stages, or the width of the sensors behind a fibre."""
         return self.geometry.stages if self.fibre is None else self.fibre.sensor_pixels
 
     @property
     def columns(self) -> dict[str, tuple[int, int]]:
-        """Compact layout: arm → first column and the one after the last; empty in the others."""
+        """Compact layout: arm → first and end column of its image; empty in the other layouts."""
         if self.cameras.layout != "compact":
             return {}
         starts = {"a": self.cameras.a.first_column, "b": self.cameras.b.first_column}
@@ -287,17 +290,17 @@ class RigConfig(FrozenModel):
 
     @property
     def ring_slots(self) -> int:
-        """Slots of the ring of one arm."""
+        """Number of slots in the ring of one arm."""
         seconds = self.stream.ring_seconds
         if seconds is None:
             return self.stream.ring_slots
-        # One more for the slot that is being filled; and the reserve, which is a share of all slots, on top.
+        # One more for the slot that is being filled, plus the reserve, which is a fraction of all slots.
         past = math.ceil(seconds * self.line_rate_hz / self.stream.block_lines) + 1
         return past + max(2, math.ceil(past / (RING_RESERVE_SHARE - 1)))
 
     @property
     def chunk_lines(self) -> int:
-        """Lines per chunk of a recording. A block of some MB is one chunk: it is written without a copy."""
+        """Lines per chunk of a recording. A block of 0.5 to 2 MiB is one chunk, written without a copy."""
         if self.recording.chunk_lines is not None:
             return self.recording.chunk_lines
         line_bytes = self.pixels * np.dtype(self.cameras.a.dtype).itemsize
@@ -308,7 +311,7 @@ class RigConfig(FrozenModel):
 
     @property
     def tag_chunks(self) -> int:
-        """Chunks of a recording's lines whose tags share one chunk."""
+        """Number of a recording's chunks of lines whose tags share one chunk."""
         recording = self.recording
         return usual_tag_chunks(
             self.chunk_lines, recording.shard_chunks, self.line_rate_hz, recording.commit_s
@@ -316,12 +319,12 @@ class RigConfig(FrozenModel):
 
     @property
     def ring_reserve(self) -> int:
-        """Those of them that do not serve as history."""
+        """Number of ring slots that are not used as history."""
         return max(2, self.ring_slots // RING_RESERVE_SHARE)
 
     @property
     def history_s(self) -> float:
-        """Seconds of lines from the past that a full ring holds for certain."""
+        """Seconds of past lines that a full ring is guaranteed to hold."""
         slots = self.ring_slots - self.ring_reserve - 1
         return max(0, slots) * self.stream.block_lines / self.line_rate_hz
 

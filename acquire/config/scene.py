@@ -1,15 +1,15 @@
-"""What scene files have in common: what stands before a scene, and which effects its simulation has.
+"""The keys that all scene files share: shutters and optics before the scene, and simulated effects.
 
 ::
 
-    scene = one kind  (leds, usaf, digits, sprites, video, function, sum of parts, or anybody's)
-            seen through shutters (window, chopper), in order
-            + optics (which layout, how each arm is turned)
+    scene = one kind  (leds, usaf, digits, sprites, video, function, sum of parts, or a plug-in's)
+            behind shutters (window, chopper), in order
+            + optics (the layout, and the rotation of each arm)
             + effects (`acquire.config.effect`), each absent unless listed
 
-What a kind shows, and its own keys, are a class that an entry point names (`acquire.sim.scene.SceneModel`).
+The class of a kind, with its own keys, is named by an entry point (`acquire.sim.scene.SceneModel`).
 
-Positions and sizes are fractions of the scene's side unless their name says otherwise.
+Positions and sizes are fractions of the scene's side unless their names state otherwise.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ class PulseDrive(FrozenModel):
 
 
 class TriangleDrive(FrozenModel):
-    """From ``low`` up to ``high`` in the middle of each period and back."""
+    """Rises from ``low`` to ``high`` in the middle of each period and falls back."""
 
     waveform: Literal["triangle"]
     frequency_hz: float = Field(gt=0)
@@ -71,7 +71,7 @@ DriveConfig = Annotated[
 
 
 class WindowPhase(FrozenModel):
-    """A stretch of time of a window: open, or a slit that slides along ``axis`` from ``begin`` to ``end``."""
+    """One phase of a window: open, or a slit that slides along ``axis`` from ``begin`` to ``end``."""
 
     duration_s: Seconds = Field(gt=0)
     axis: Literal["row", "column", "open"] = "open"
@@ -81,29 +81,29 @@ class WindowPhase(FrozenModel):
 
 
 class WindowConfig(FrozenModel):
-    """A window before the scene, phase after phase in a loop (Fig. 8)."""
+    """A window before the scene, with its phases in a loop (Fig. 8)."""
 
     kind: Literal["window"]
     phases: tuple[WindowPhase, ...] = Field(min_length=1)
 
 
 class ChopperConfig(FrozenModel):
-    """A wheel whose blades pass before the scene (Fig. 11); turns counter-clockwise for positive rates."""
+    """A wheel whose blades pass before the scene (Fig. 11); positive rates are counter-clockwise."""
 
     kind: Literal["chopper"]
-    row: float = Field(default=1.6, ge=-100, le=100, description="the axle")
-    column: float = Field(default=0.5, ge=-100, le=100, description="the axle")
+    row: float = Field(default=1.6, ge=-100, le=100, description="position of the axle")
+    column: float = Field(default=0.5, ge=-100, le=100, description="position of the axle")
     blades: int = Field(default=10, ge=1, le=1000)
-    open_part: float = Field(default=0.5, gt=0, lt=1, description="of the circle that is not blade")
-    rotation_hz: float = Field(description="turns per second")
-    phase_deg: float = Field(default=0.0, description="where blade 0 begins at sub-step 0")
+    open_part: float = Field(default=0.5, gt=0, lt=1, description="fraction of the circle without blades")
+    rotation_hz: float = Field(description="rotations per second")
+    phase_deg: float = Field(default=0.0, description="angle at which blade 0 begins at sub-step 0")
 
 
 ShutterConfig = Annotated[WindowConfig | ChopperConfig, Field(discriminator="kind")]
 
 
 class ArmOptics(FrozenModel):
-    """How one arm sees the scene: mirrored left to right if so, then turned counter-clockwise."""
+    """How one arm sees the scene: mirrored left to right if ``mirror``, then rotated counter-clockwise."""
 
     turn_deg: Literal[0, 90, 180, 270] = 0
     mirror: bool = False
@@ -112,10 +112,10 @@ class ArmOptics(FrozenModel):
 class OpticsConfig(FrozenModel):
     """The layout of the instrument.
 
-    ``dual``        two cameras of M stages with S intra-line steps each
-    ``compact``     one camera, the images of both arms on two ranges of its columns (Fig. 2b)
-    ``emulated``    two cameras of n = M·S stages with whole steps, lines then merged S × S (Sect. 5.1)
-    ``interline``   the baseline: M stages with whole steps, S = 1, the scene finer by ``baseline_factor``
+    ``dual``        two cameras of M stages with S sub-steps per line
+    ``compact``     one camera with the images of both arms on two ranges of its columns (Fig. 2b)
+    ``emulated``    two cameras of n = M·S stages without sub-steps, whose lines are merged S × S (Sect. 5.1)
+    ``interline``   the baseline: M stages, S = 1, and a scene that is finer by ``baseline_factor``
     """
 
     layout: Literal["dual", "compact", "emulated", "interline"] = "dual"
@@ -123,23 +123,29 @@ class OpticsConfig(FrozenModel):
     b: ArmOptics = ArmOptics(turn_deg=90)
     sensor_pixels: int = Field(default=256, ge=2, le=65536, description="compact: columns of the camera")
     column_a: int = Field(default=0, ge=0, le=2**16, description="compact: first column of arm A")
-    column_b: int | None = Field(default=None, ge=0, le=2**16, description="compact: absent: half-way")
-    raw_bits: int = Field(
-        default=12, ge=1, le=16, description="emulated: of the lines before they are merged"
+    column_b: int | None = Field(
+        default=None, ge=0, le=2**16, description="compact: first column of arm B; absent: the middle"
     )
-    baseline_factor: int = Field(default=3, ge=1, le=16, description="interline: fine sub-steps per step")
+    raw_bits: int = Field(
+        default=12, ge=1, le=16, description="emulated: bits of the lines before they are merged"
+    )
+    baseline_factor: int = Field(
+        default=3, ge=1, le=16, description="interline: the scene's sub-steps per transfer of the sensor"
+    )
 
 
 class SceneBase(FrozenModel):
-    """What every scene file may say. ``kind`` is the name of the scene's entry point."""
+    """The keys of every scene file. ``kind`` is the name of the scene's entry point."""
 
     kind: str
     title: str = ""
-    rig: str = Field(default="rig-demo", description="the rig that `acquire simulate` takes for it")
-    lines: int = Field(default=33_334, ge=1, le=MOST_LINES, description="that `acquire simulate` writes")
+    rig: str = Field(default="rig-demo", description="the rig that `acquire simulate` uses for it")
+    lines: int = Field(
+        default=33_334, ge=1, le=MOST_LINES, description="number of lines that `acquire simulate` writes"
+    )
     shutters: tuple[ShutterConfig, ...] = ()
     optics: OpticsConfig = OpticsConfig()
-    seed: int = Field(default=0, ge=0, lt=SEED_END, description="of the effects' random streams")
+    seed: int = Field(default=0, ge=0, lt=SEED_END, description="seed of the effects' random streams")
     system_gain_dn_per_e: float = Field(
         default=0.1, gt=0, description="K of EMVA 1288, for effects that count electrons"
     )
@@ -147,18 +153,18 @@ class SceneBase(FrozenModel):
 
     @property
     def sources(self) -> int:
-        """About how many pictures it holds at once: what its memory is foreseen by."""
+        """Approximate number of pictures that it holds at once, from which its memory is estimated."""
         return 4
 
     def anchored(self, directory: Path) -> Self:  # noqa: ARG002
-        """The scene with its files named from ``directory`` on, so that any process finds them."""
+        """Return the scene with paths resolved from ``directory``, so that any process finds its files."""
         return self
 
     @model_validator(mode="after")
     def _effects_differ(self) -> SceneBase:
         kinds = [effect.kind for effect in self.effects]
         if len(set(kinds)) < len(kinds):
-            raise ValueError(f"an effect is listed once, not {', '.join(kinds)}")
+            raise ValueError(f"each effect can be listed only once, not {', '.join(kinds)}")
         return self
 
 

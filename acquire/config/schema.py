@@ -1,4 +1,4 @@
-"""JSON schemas for editors: of a model, and of every installed class that it has a place for."""
+"""JSON schemas for editors, of a model and of every installed class that its tables may use."""
 
 from __future__ import annotations
 
@@ -16,48 +16,54 @@ _GROUPS = {group.name: group for group in GROUPS}
 
 
 def whole_schema(model: type[BaseModel]) -> dict[str, Any]:
-    """The JSON schema of a model, with the classes of every group that it has a place for.
+    """Return the JSON schema of a model, including the classes of every group that its tables may use.
 
-    A table with a ``kind`` is one of the group's classes; ``options`` are what the ``driver`` beside them
-    says. What cannot be imported is left out.
+    A table with a ``kind`` is one of the group's classes; ``options`` are those of the ``driver`` next to
+    them. Classes that cannot be imported are left out.
     """
     schema = model.model_json_schema()
     definitions = schema.setdefault("$defs", {})
-    waiting, defined = list(_filled(schema)), set[str]()
+    waiting, defined = list(_resolve_marks(schema)), set[str]()
     while waiting:
         name = waiting.pop()
         if name in defined:
             continue
         defined.add(name)
-        if any("kind" in choice.model_fields for choice in _GROUPS[name].working().values()):
-            definitions[name] = _one_of(name)
-        for kind, choice in _GROUPS[name].working().items():
-            one = choice.model_json_schema(ref_template=f"#/$defs/{name}.{kind}.{{model}}")
-            below = one.pop("$defs", {})
-            definitions[f"{name}.{kind}"] = one
-            definitions.update({f"{name}.{kind}.{key}": value for key, value in below.items()})
-            waiting += _filled([one, below])
+        classes = _GROUPS[name].working()
+        if any("kind" in each.model_fields for each in classes.values()):
+            mapping = {kind: f"#/$defs/{name}.{kind}" for kind in classes}
+            definitions[name] = {
+                "oneOf": [{"$ref": ref} for ref in mapping.values()],
+                "discriminator": {"propertyName": "kind", "mapping": mapping},
+            }
+        for kind, each in classes.items():
+            definition = each.model_json_schema(ref_template=f"#/$defs/{name}.{kind}.{{model}}")
+            nested = definition.pop("$defs", {})
+            definitions[f"{name}.{kind}"] = definition
+            definitions.update({f"{name}.{kind}.{key}": value for key, value in nested.items()})
+            waiting += _resolve_marks([definition, nested])
     return schema
 
 
-def _one_of(name: str) -> dict[str, Any]:
-    mapping = {kind: f"#/$defs/{name}.{kind}" for kind in _GROUPS[name].working()}
-    choices = [{"$ref": ref} for ref in mapping.values()]
-    return {"oneOf": choices, "discriminator": {"propertyName": "kind", "mapping": mapping}}
-
-
-def _filled(node: Any) -> Iterator[str]:
-    """Replace every mark by what stands for it; the names of the groups that are then to be defined."""
+def _resolve_marks(node: Any) -> Iterator[str]:
+    """Replace every group's mark by references; yield the names of the groups, which must then be defined."""
     if isinstance(node, list):
         for value in node:
-            yield from _filled(value)
+            yield from _resolve_marks(value)
     if not isinstance(node, dict):
         return
     options = node.get("properties", {}).get("options", {})
     if GROUP_KEY in options:
         name = options.pop(GROUP_KEY)
-        options.pop("default", None)  # the driver's own
-        node["allOf"] = [_where(driver, f"#/$defs/{name}.{driver}") for driver in _GROUPS[name].working()]
+        options.pop("default", None)  # the default is the driver's own
+        # A table without a driver has the default one, which an editor need not know.
+        node["allOf"] = [
+            {
+                "if": {"properties": {"driver": {"const": driver}}, "required": ["driver"]},
+                "then": {"properties": {"options": {"$ref": f"#/$defs/{name}.{driver}"}}},
+            }
+            for driver in _GROUPS[name].working()
+        ]
         yield name
     if GROUP_KEY in node:
         name = node.pop(GROUP_KEY)
@@ -65,10 +71,4 @@ def _filled(node: Any) -> Iterator[str]:
         node["$ref"] = f"#/$defs/{name}"
         yield name
     for value in list(node.values()):
-        yield from _filled(value)
-
-
-def _where(driver: str, ref: str) -> dict[str, Any]:
-    """Options of one driver; a table that names none is of the default one, which an editor need not know."""
-    named = {"properties": {"driver": {"const": driver}}, "required": ["driver"]}
-    return {"if": named, "then": {"properties": {"options": {"$ref": ref}}}}
+        yield from _resolve_marks(value)

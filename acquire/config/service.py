@@ -1,4 +1,4 @@
-"""Models of a rig's ``[service]`` and ``[hooks]``: what the daemon does on its own, and whom it notifies."""
+"""Models of a rig's ``[service]`` and ``[hooks]``: what the daemon does on its own, and its notifications."""
 
 from __future__ import annotations
 
@@ -12,45 +12,47 @@ from acquire.config.base import FrozenModel
 
 
 class ServiceConfig(FrozenModel):
-    """What the daemon does on its own once it has started, as after a crash or a power failure."""
+    """What the daemon does on its own after it has started, for example after a crash or a power failure."""
 
     begin: Literal["idle", "armed", "recording"] = Field(
         default="idle",
         description="'armed': it arms; 'recording': it arms and records until stopped, to a new recording "
-        "named after rig and time; both are tried again until they succeed or a command comes",
+        "named after rig and time; both are retried until they succeed or a command comes",
     )
-    retry_s: float = Field(default=10.0, gt=0, le=3600, description="between two tries")
+    retry_s: float = Field(default=10.0, gt=0, le=3600, description="time between two attempts")
     log_level: Literal["info", "warning", "error"] = Field(
-        default="info", description="of the daemon's log: what matters less is not written"
+        default="info", description="lowest level of entries in the daemon's log"
     )
 
     @property
     def level(self) -> int:
-        """As `logging` has it."""
+        """The log level as a number of `logging`."""
         return logging.getLevelNamesMapping()[self.log_level.upper()]
 
 
 class HooksConfig(FrozenModel):
-    """Whom the daemon tells when something is wrong; one after the other, and nobody waits for them."""
+    """Notifications of the daemon when something is wrong, sent one at a time and in the background."""
 
     on: tuple[Literal["fault", "loss", "disk", "verdict", "trouble"], ...] = Field(
         default=("fault", "loss", "disk"),
-        description="'fault': the state is faulted; 'loss': lines were lost; 'disk': it is full soon, or has "
-        "room again; 'verdict': what the lines say of the light's code",
+        description="'fault': the state is faulted; 'loss': lines were lost; 'disk': it is nearly full, or "
+        "has room again; 'verdict': the result of checking the light's code in the lines",
     )
     command: tuple[str, ...] = Field(
-        default=(), description="program and words; the event is JSON on its standard input"
+        default=(), description="program and arguments; the event is JSON on its standard input"
     )
-    webhook: str | None = Field(default=None, description="URL that the event is posted to as JSON")
-    timeout_s: float = Field(default=10.0, gt=0, le=600, description="for either; then it is given up")
+    webhook: str | None = Field(default=None, description="URL to which the event is posted as JSON")
+    timeout_s: float = Field(
+        default=10.0, gt=0, le=600, description="time after which command or webhook is abandoned"
+    )
 
     @field_validator("webhook")
     @classmethod
     def _is_http(cls, url: str | None) -> str | None:
-        """The configuration goes into every recording: no place for secrets."""
+        """Refuse secrets, because the configuration is stored in every recording."""
         parts = urlsplit(url or "http://x")
         if parts.scheme not in ("http", "https") or not parts.hostname:
-            raise ValueError("it is not a URL of http or https")
+            raise ValueError("it is not an http or https URL")
         if "@" in parts.netloc:
-            raise ValueError("credentials would be written into every recording: let a command send them")
+            raise ValueError("credentials would be stored in every recording; use a command to send them")
         return url

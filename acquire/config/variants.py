@@ -1,6 +1,6 @@
-"""Tables whose ``kind`` or ``driver`` decides what they may hold, whoever's class that is.
+"""Tables whose ``kind`` or ``driver`` selects their model, which may be a plug-in's class.
 
-A class is imported when a file names it (`acquire.plugins`); pydantic then knows the rest.
+A class is imported when a file names it (`acquire.plugins`), and its table is then validated by pydantic.
 """
 
 from __future__ import annotations
@@ -19,13 +19,14 @@ if TYPE_CHECKING:
     from pydantic.json_schema import JsonSchemaValue
 
 GROUP_KEY = "x-acquire-group"
-"""Marks, in a JSON schema that is not yet whole, where a group's classes go (`acquire.config.schema`)."""
+"""Marks the place of a group's classes in an incomplete JSON schema (`acquire.config.schema`)."""
 
 
 @dataclass(frozen=True, slots=True)
 class OneOf:
-    """Annotates a field: a table of one of a group's models, or such a model. Errors have its kind in their
-    location, as those of pydantic's own unions.
+    """Annotates a field that is a table of one of a group's models, or such a model.
+
+    Errors have the kind in their location, like those of pydantic's own unions.
     """
 
     group: Group
@@ -38,7 +39,7 @@ class OneOf:
     ) -> core_schema.CoreSchema:
         return core_schema.no_info_plain_validator_function(
             self._validated,
-            serialization=core_schema.simple_ser_schema("any"),  # as the class that it is
+            serialization=core_schema.simple_ser_schema("any"),  # serialised as its actual class
         )
 
     def __get_pydantic_json_schema__(
@@ -52,7 +53,7 @@ class OneOf:
         if isinstance(value, self.base):
             return value
         if not isinstance(value, dict):
-            raise PydanticCustomError("table", "a table with its kind was expected")
+            raise PydanticCustomError("table", "a table with a kind was expected")
         kind = value.get("kind")
         if kind is None:
             kinds = ", ".join(self.group.names())
@@ -63,7 +64,7 @@ class OneOf:
 
 @dataclass(frozen=True, slots=True)
 class NameOf:
-    """Annotates a text: the name of a class of a group."""
+    """Annotates a string that is the name of a class of a group."""
 
     group: Group
 
@@ -86,7 +87,7 @@ class NameOf:
 
 @dataclass(frozen=True, slots=True)
 class OptionsOf:
-    """Annotates ``options``: a table of the class that the field ``driver`` before it names."""
+    """Annotates ``options``, a table of the class that the preceding field ``driver`` names."""
 
     group: Group
 
@@ -109,7 +110,7 @@ class OptionsOf:
     def _validated(self, value: Any, info: core_schema.ValidationInfo) -> Any:
         driver = info.data.get("driver")
         if driver is None:
-            return None  # what it is was refused already
+            return None  # the driver itself was refused, which is already an error
         model = _class_of(self.group, driver)
         if isinstance(value, model):
             return value
@@ -125,6 +126,6 @@ def _class_of(group: Group, name: str) -> Any:
 
 @cache
 def _tagged(kind: str, model: type[BaseModel]) -> SchemaValidator:
-    """A union of one, so that errors have its name in their location."""
+    """Return the validator of a union with one member, so that errors have its name in their location."""
     only = core_schema.no_info_plain_validator_function(model.model_validate)
     return SchemaValidator(core_schema.tagged_union_schema({kind: only}, discriminator=lambda _: kind))

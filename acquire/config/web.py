@@ -10,33 +10,33 @@ from acquire.config.base import FilePath, FrozenModel
 
 
 class WebConfig(FrozenModel):
-    """The operator's page, in a process of its own; who may enter it is told by a token."""
+    """The operator's page, which runs in its own process and is protected by tokens."""
 
     host: str = Field(
-        default="127.0.0.1", description="address to listen on; another than loopback needs a certificate"
+        default="127.0.0.1", description="address to listen on; any but loopback needs a certificate"
     )
-    port: int = Field(default=8300, ge=0, le=65535, description="0: any that is free; the log names it")
+    port: int = Field(default=8300, ge=0, le=65535, description="0: any free port; the log names it")
     names: tuple[str, ...] = Field(
-        default=(), description="names by which browsers may ask for the page, besides the host's address"
+        default=(), description="host names by which browsers may open the page, besides the host's address"
     )
     certificate: FilePath | None = Field(default=None, description="PEM file, for https; with `key`")
     key: FilePath | None = Field(default=None, description="PEM file of the certificate's private key")
     token_file: FilePath | None = Field(
-        default=None, description="where the tokens are kept; absent: beside the control socket"
+        default=None, description="file that stores the tokens; absent: next to the control socket"
     )
     plain: bool = Field(
         default=False,
-        description="another address than loopback without a certificate: token and pictures can be read by "
-        "whoever is on the way",
+        description="true: allow an address other than loopback without a certificate; token and pictures "
+        "can then be read on the network",
     )
 
     @model_validator(mode="after")
     def _closed_to_strangers(self) -> WebConfig:
         if (self.certificate is None) != (self.key is None):
-            raise ValueError("certificate and key belong together")
+            raise ValueError("certificate and key must be given together")
         if not self.is_loopback and self.certificate is None and not self.plain:
             raise ValueError(
-                f"host {self.host} can be reached from elsewhere; possible: 127.0.0.1 (and ssh -L), a "
+                f"host {self.host} can be reached from other hosts; possible: 127.0.0.1 (and ssh -L), a "
                 "certificate and key, or plain = true"
             )
         return self

@@ -20,7 +20,7 @@ from acquire.evaluate.metrics import psnr, ssim
 from acquire.forward import merge_video
 from acquire.recon import reconstruct
 from acquire.sim.leds import LedScene
-from acquire.sim.optics import seen_in
+from acquire.sim.optics import tile_view
 from acquire.sim.scene import Scene
 from acquire.sim.voxels import truth
 from acquire.simulate import bench_of
@@ -115,7 +115,7 @@ class Judge:
             return cls(segment, None)
         scene = bench_of(*load_recorded(attrs, str(recording))).fine_scene()
         if tile is not None and recording.fibre is not None:
-            scene = seen_in(scene, recording.fibre, tile)
+            scene = tile_view(scene, recording.fibre, tile)
         return cls(segment, scene)
 
     def frames(self, voxels: Voxels) -> slice:

@@ -1,17 +1,17 @@
-"""Simulated devices: a trigger and two cameras that behave as the real ones, and what they look at.
+"""Simulated devices: a trigger and two cameras that behave like the real ones, and the scenes before them.
 
 ::
 
     scenes ─▶ lines: Eq. (1), streamed ─┐
-    effects: stages that are listed ────┼─▶ pipeline: a camera's lines ─┐
+    effects: the listed stages ─────────┼─▶ pipeline: a camera's lines ─┐
                                         │                               ├─▶ devices    replay: stored lines
     light: code and drives ─────────────┘      clock: pulses on a wire ─┘
-    voxels: the truth, for comparison
+    voxels: ground truth, for comparison
 
-From Python, without files: ``Bench(scene_config, geometry, cameras, substep_s).camera("a", code)``, or any
-object that is a `Scene` under a `StreamingArm`.
+From Python, without files: ``Bench(scene_config, geometry, cameras, substep_s).camera("a", code)``, or a
+`StreamingArm` on any object that satisfies `Scene`.
 
-Names are imported when they are asked for: a rig with a simulated trigger and real cameras has no scene.
+Names are imported on first use: a rig with a simulated trigger and real cameras needs no scene.
 """
 
 from __future__ import annotations

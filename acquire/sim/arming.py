@@ -1,4 +1,4 @@
-"""What the trigger's device checks when a run is armed, in the order in which it names the first fault."""
+"""Checks that the trigger makes when a run is armed, in the order in which it reports the first error."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ if TYPE_CHECKING:
 
 
 class Refusal(Exception):  # noqa: N818 - a NAK on its way to the host, not an error of this program
-    """The device says no: ``code`` is an ErrorCode, ``address`` the word that it is about."""
+    """The trigger refuses a request: ``code`` is an ErrorCode, ``address`` that of the word at fault."""
 
     def __init__(self, code: int, address: int) -> None:
         super().__init__(code, address)
@@ -20,19 +20,20 @@ class Refusal(Exception):  # noqa: N818 - a NAK on its way to the host, not an e
 
 
 def check_configuration(get: Callable[[r.Register], int], locked: bool, code_checked: bool) -> None:
-    """Raises Refusal for the first thing that cannot be honoured. ``get`` reads a register."""
+    """Raise Refusal for the first setting that cannot be honoured. ``get`` reads a register."""
     if not locked:
         raise Refusal(ErrorCode.CLOCK_UNLOCKED, r.STATUS.address)
-    for faults in (_timing(get), _code(get, code_checked), _light(get), _outputs(get)):
-        for wrong, code, register in faults:
-            if wrong:
+    for checks in (_timing(get), _code(get, code_checked), _light(get), _outputs(get)):
+        for failed, code, register in checks:
+            if failed:
                 raise Refusal(code, register.address)
 
 
-_Fault = tuple[bool, ErrorCode, r.Register]
+_Check = tuple[bool, ErrorCode, r.Register]
+"""Whether the check failed, the error to report, and the register at fault."""
 
 
-def _timing(get: Callable[[r.Register], int]) -> Iterator[_Fault]:
+def _timing(get: Callable[[r.Register], int]) -> Iterator[_Check]:
     limits, clocks, substeps = get(r.LIMITS), get(r.SUBSTEP_CLOCKS), r.LINE.substeps.of(get(r.LINE))
     longest = (1 << r.LIMITS.substep_max_log2.of(limits)) - 1
     yield not r.LIMITS.substep_min.of(limits) <= clocks <= longest, ErrorCode.BAD_SUBSTEP, r.SUBSTEP_CLOCKS
@@ -42,7 +43,7 @@ def _timing(get: Callable[[r.Register], int]) -> Iterator[_Fault]:
     yield get(r.TAG_INTERVAL) == 0, ErrorCode.BAD_TAG_INTERVAL, r.TAG_INTERVAL
 
 
-def _code(get: Callable[[r.Register], int], checked: bool) -> Iterator[_Fault]:
+def _code(get: Callable[[r.Register], int], checked: bool) -> Iterator[_Check]:
     kind = r.CODE_SOURCE.kind.of(get(r.CODE_SOURCE))
     yield kind not in tuple(Source), ErrorCode.BAD_SOURCE, r.CODE_SOURCE
     if kind == Source.PRBS:
@@ -54,14 +55,14 @@ def _code(get: Callable[[r.Register], int], checked: bool) -> Iterator[_Fault]:
         yield not checked, ErrorCode.CODE_UNCHECKED, r.CODE_LENGTH
 
 
-def _light(get: Callable[[r.Register], int]) -> Iterator[_Fault]:
+def _light(get: Callable[[r.Register], int]) -> Iterator[_Check]:
     clocks, opens, closes = get(r.SUBSTEP_CLOCKS), get(r.WINDOW_OPEN), get(r.WINDOW_CLOSE)
     yield not opens < closes <= clocks, ErrorCode.BAD_WINDOW, r.WINDOW_CLOSE
     margin = r.LIMITS.lead_margin.of(get(r.LIMITS))
     yield r.LED.lead.of(get(r.LED)) + margin > clocks, ErrorCode.BAD_LEAD, r.LED
 
 
-def _outputs(get: Callable[[r.Register], int]) -> Iterator[_Fault]:
+def _outputs(get: Callable[[r.Register], int]) -> Iterator[_Check]:
     distance = pulse_distance(get)
     for enable, delay, width, code in (
         (r.TRIGGER_A, r.TRIGGER_A_DELAY, r.TRIGGER_A_WIDTH, ErrorCode.BAD_TRIGGER_A),
@@ -74,7 +75,7 @@ def _outputs(get: Callable[[r.Register], int]) -> Iterator[_Fault]:
 
 
 def pulse_distance(get: Callable[[r.Register], int]) -> int:
-    """Clocks between pulses of an output."""
+    """Clock cycles between two pulses of an output."""
     line = get(r.LINE)
     per_substep = r.LINE.mode.of(line) == LineMode.PER_SUBSTEP
     return get(r.SUBSTEP_CLOCKS) * (1 if per_substep else r.LINE.substeps.of(line))

@@ -1,19 +1,19 @@
-"""The wire between a simulated trigger and simulated cameras: who pulses, since when, how fast.
+"""The wire between a simulated trigger and simulated cameras: a pulse train with its start and its rate.
 
-Nothing travels along it. The trigger writes down one *pulse train* in a page of shared memory without a
-name, and whoever holds the page works out from the host's monotonic clock how many pulses have been
-issued by now::
+Nothing travels along it. The trigger writes one *pulse train* into an anonymous page of shared memory, and
+every process that maps the page computes from the host's monotonic clock how many pulses have been issued
+so far::
 
     trigger process                   memfd, one page                      camera processes
-    start / stop  ──▶ [ sequence | crc | length | pulse train as JSON ] ◀── look / wait
+    start / stop  ──▶ [ sequence | crc | length | pulse train as JSON ] ◀── read / wait
 
 Pulse ``p`` is issued ``p`` line periods of simulated time after the start; simulated time runs ``speed``
-times as fast as the host's. All of it is exact integer arithmetic.
+times as fast as the host's. All arithmetic is exact, on integers.
 
-Reading is optimistic (a sequence lock): the sequence is odd while the trigger writes, and a reading counts
-only if the sequence was the same even number before and after it *and the clock* were read. So no reader
-can believe in a pulse that a stop has cut off. The checksum catches the rest, whatever a processor
-reorders. A trigger killed half-way through a write leaves an odd sequence: readers then raise.
+Reading is optimistic (a sequence lock): the sequence is odd while the trigger writes, and a reading is valid
+only if the sequence was the same even number before and after both the train *and the clock* were read. So
+no reader can count a pulse that a stop has cut off. The checksum catches anything that the processor
+reorders. A trigger killed half-way through a write leaves an odd sequence, and readers then raise.
 """
 
 from __future__ import annotations
@@ -46,21 +46,21 @@ _RECORD = struct.Struct("@II")
 _RECORD_AT = _SEQUENCE.size
 _PAYLOAD_AT = _RECORD_AT + _RECORD.size
 _ROOM = _PAGE - _PAYLOAD_AT - 64
-"""Bytes for a train when it starts; the number it stops after comes on top."""
+"""Bytes available for a train when it starts; 64 more are reserved for the count it stops after."""
 _POLL_S = 0.002
-"""How often a waiter looks for a start; pulses themselves are awaited by their due time."""
+"""Polling interval while waiting for a start; pulses themselves are awaited by their due time."""
 _STOP_POLL_S = 0.008
-"""How often it looks for a stop while pulses come: often would be most of what a fast camera costs."""
+"""Polling interval for a stop during a train: shorter polling would dominate the cost of a fast camera."""
 _WRITE_S, _LONGEST_WRITE_S = 1e-5, 5e-3
-"""Between two looks at a wire that is being written, at first and at last: readers run before the writer on a
-busy host, and two that look all the time would keep it from going on."""
+"""First and longest pause between two attempts to read while the wire is being written. On a busy host
+readers can be scheduled ahead of the writer, and two that poll without pause would keep it from finishing."""
 _TORN_S = 15.0
-"""A write takes microseconds, or as long as a busy host keeps the writer from running: a sequence that
+"""A write takes microseconds, or as long as a busy host keeps the writer from running. A sequence that
 stays odd this long belongs to a writer that died."""
 
 
 class Clock(Protocol):
-    """The host's time. Tests supply one that moves when it is told to."""
+    """The host's time. Tests supply a clock that they advance themselves."""
 
     def monotonic_ns(self) -> int: ...
 
@@ -88,12 +88,19 @@ class HostClock:
 class PulseTrain:
     """The pulses of one run: pulse ``p`` comes ``p · line_period_ns / speed`` ns after ``start_ns``.
 
-    ``run`` counts the trains of a wire from 1; ``start_ns`` is CLOCK_MONOTONIC; ``line_period_ns`` is
-    simulated time; ``code`` is what `acquire.codes.code_from_attrs` reads; ``stopped_after`` is the
-    number of pulses after which the train ended, None while it lasts; ``budget`` is the number that it
-    does not exceed unless more are allowed, None where only a stop ends it; ``settled_s`` is by how much the
-    trigger starts an arm's line after the light of its first sub-step, by its lead and delays; ``lit_part``
-    is from where to where of a lit sub-step the light is on.
+    Attributes
+    ----------
+    run : number of the train on this wire, counted from 1
+    start_ns : CLOCK_MONOTONIC of pulse 0
+    line_period_ns : in simulated time
+    speed : simulated seconds per second
+    code : the light's code, as `acquire.codes.code_from_attrs` reads it
+    stopped_after : number of pulses after which the train ended, None while it lasts
+    budget : number of pulses that the train does not exceed unless more are allowed; None if only a stop
+        ends it
+    settled_s : arm → time from the light of a line's first sub-step to the start of the line, which the
+        trigger sets by its lead and delays
+    lit_part : begin and end of the light within a lit sub-step, as fractions of it
     """
 
     run: int
@@ -107,7 +114,7 @@ class PulseTrain:
     lit_part: tuple[float, float] = (0.0, 1.0)
 
     def issued(self, now_ns: int) -> int:
-        """Pulses issued by ``now_ns``, pulse 0 at the start included; 0 before the start."""
+        """Return the pulses issued by ``now_ns``, including pulse 0 at the start; 0 before the start."""
         spacing = self.line_period_ns / self.speed
         elapsed_ns = now_ns - self.start_ns
         pulses = elapsed_ns * spacing.denominator // spacing.numerator + 1 if elapsed_ns >= 0 else 0
@@ -115,14 +122,14 @@ class PulseTrain:
         return min(pulses, *limits) if limits else pulses
 
     def due_ns(self, pulse: int) -> int:
-        """The first whole ns (CLOCK_MONOTONIC) at which ``pulse`` has been issued."""
+        """Return the first whole ns (CLOCK_MONOTONIC) at which ``pulse`` has been issued."""
         spacing = self.line_period_ns / self.speed
-        return self.start_ns - (-pulse * spacing.numerator // spacing.denominator)
+        return self.start_ns - (-pulse * spacing.numerator // spacing.denominator)  # rounded up
 
 
 @dataclass(frozen=True, slots=True)
 class Reading:
-    """What a look at the wire showed: the latest train, None before the first, and its pulses so far."""
+    """One reading of the wire: the latest train (None before the first) and its pulses so far."""
 
     train: PulseTrain | None
     issued: int
@@ -141,11 +148,11 @@ class Reading:
 
 
 class Wire:
-    """One trigger's pulses, seen by every process that was given the wire when it was spawned.
+    """One trigger's pulses, visible to every process that was given the wire when it was spawned.
 
-    One process writes (the trigger's), any number look. A wire can be given to a child only while that
-    child is being spawned; it has no name that could outlive the processes. Closing is idempotent, and a
-    forgotten wire closes itself.
+    One process writes (the trigger's); any number read. A wire can be passed to a child only while that
+    child is being spawned, because it has no name that could outlive the processes. Closing is idempotent,
+    and a wire that is garbage-collected closes itself.
     """
 
     def __init__(self, clock: Clock | None = None) -> None:
@@ -175,23 +182,24 @@ class Wire:
         settled_s: Mapping[str, float] | None = None,
         lit_part: tuple[float, float] = (0.0, 1.0),
     ) -> PulseTrain:
-        """Begin a train now, or at ``start_ns``; DeviceError while another one lasts."""
+        """Begin a train now, or at ``start_ns``. Raises DeviceError while another train lasts."""
         with self._writing:
             sequence, latest = self._observe()
             if latest.running:
-                raise DeviceError(f"pulse train {latest.run} still runs", hint="stop it first")
+                raise DeviceError(f"pulse train {latest.run} is still running", hint="stop it first")
             train = PulseTrain(latest.run + 1, 0, line_period_ns, speed, dict(code), budget=budget)
             train = replace(train, settled_s=dict(settled_s or {}), lit_part=lit_part)
             if len(_encode(train)) > _ROOM:
                 raise UsageError(
-                    f"a code of {len(_encode(train))} bytes is too long", possible=f"{_ROOM} on the wire"
+                    f"a code of {len(_encode(train))} bytes is too long for the wire",
+                    possible=f"up to {_ROOM} bytes",
                 )
             return self._write(
                 sequence, lambda now_ns: replace(train, start_ns=now_ns if start_ns is None else start_ns)
             )
 
     def stop(self) -> int:
-        """End the train after the pulses issued so far; their number. Idempotent."""
+        """End the train after the pulses issued so far and return their number. Idempotent."""
         with self._writing:
             sequence, latest = self._observe()
             train = latest.train
@@ -203,7 +211,7 @@ class Wire:
     def allow(self, pulses: int) -> int:
         """Let the train issue ``pulses`` pulses and no more, unless more are allowed later.
 
-        Returns the number it will issue: at least one, and those issued so far.
+        Returns the number it will issue: at least one, and no fewer than were issued so far.
         """
         with self._writing:
             sequence, latest = self._observe()
@@ -216,17 +224,17 @@ class Wire:
             return allowed.budget or 0
 
     def read(self) -> Reading:
-        """The latest train and the pulses it has issued at this moment."""
+        """Return the latest train and the pulses it has issued at this moment."""
         return self._observe()[1]
 
     def code(self, train: PulseTrain) -> Code:
-        """The light's code during a train."""
+        """Return the light's code during a train."""
         return code_from_attrs(train.code)
 
     def wait(self, run: int, pulses: int, timeout_s: float) -> Reading:
-        """Look until train ``run`` has issued ``pulses`` pulses or has ended, at most for ``timeout_s``.
+        """Wait until train ``run`` has issued ``pulses`` pulses or has ended, for ``timeout_s`` at most.
 
-        The last reading is returned whatever it shows. A later train than ``run`` also ends the wait.
+        Returns the last reading, whatever it shows. A train later than ``run`` also ends the wait.
         """
         deadline_ns = self.clock.monotonic_ns() + int(timeout_s * 1e9)
         while True:
@@ -242,27 +250,27 @@ class Wire:
             self.clock.sleep(min(nap_s, max(wake_ns - now_ns, 1) * 1e-9))
 
     def _observe(self) -> tuple[int, Reading]:
-        """A sequence and the reading that belongs to it."""
-        patience_ns, nap_s = time.monotonic_ns() + int(_TORN_S * 1e9), _WRITE_S
-        while time.monotonic_ns() < patience_ns:
+        """Return a sequence number and the reading that belongs to it."""
+        deadline_ns, nap_s = time.monotonic_ns() + int(_TORN_S * 1e9), _WRITE_S
+        while time.monotonic_ns() < deadline_ns:
             sequence = self._sequence()
-            # A lock that readers never take: odd while a train is being written, and what was read counts
-            # only if the number is the same afterwards. The time is read in between, or a train might issue
-            # pulses that its stop had forbidden.
+            # Readers take no lock: the sequence is odd while a train is being written, and a reading is valid
+            # only if the sequence is the same afterwards. The clock is read in between; otherwise a reader
+            # could count pulses issued after the stop.
             if not sequence & 1 and self._refresh(sequence):
                 train, now_ns = self._known[1], self.clock.monotonic_ns()
                 if self._sequence() == sequence == self._known[0]:
                     return sequence, Reading(train, 0 if train is None else train.issued(now_ns))
             time.sleep(nap_s)
             nap_s = min(2 * nap_s, _LONGEST_WRITE_S)
-        raise DeviceError("the simulated trigger died while it wrote on the wire")
+        raise DeviceError("the simulated trigger died while it was writing to the wire")
 
     def _sequence(self) -> int:
         number: int = _SEQUENCE.unpack_from(self._page, 0)[0]
         return number
 
     def _refresh(self, sequence: int) -> bool:
-        """Make the train of an even ``sequence`` known; False if its bytes do not belong together."""
+        """Decode and keep the train of an even ``sequence``; return False if its checksum fails."""
         if self._known[0] != sequence:
             checksum, length = _RECORD.unpack_from(self._page, _RECORD_AT)
             payload = self._page[_PAYLOAD_AT : _PAYLOAD_AT + length]
@@ -275,7 +283,7 @@ class Wire:
         return True
 
     def _write(self, sequence: int, train_at: Callable[[int], PulseTrain]) -> PulseTrain:
-        """Put a train on the wire; ``train_at`` is given the time once no reader trusts the old one."""
+        """Write a train. ``train_at`` receives the time, read once readers no longer accept the old train."""
         _SEQUENCE.pack_into(self._page, 0, sequence + 1)
         train = train_at(self.clock.monotonic_ns())
         payload = _encode(train)

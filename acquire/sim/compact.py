@@ -1,4 +1,4 @@
-"""Both arms on one simulated sensor (compact layout): two cameras' lines side by side."""
+"""Both arms on one simulated sensor (compact layout): the lines of two cameras side by side."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class SideBySideOpener:
-    """Opens the sensor that both arms fall on; ``first_columns`` are where their images begin."""
+    """Opens the sensor that both arms share; ``first_columns`` are the first columns of their images."""
 
     openers: tuple[SimulatedCameraOpener, ...]
     first_columns: tuple[int, ...]
@@ -28,18 +28,18 @@ class SideBySideOpener:
 
 
 class SideBySide:
-    """One camera made of several that follow the same pulses; dark where no image falls."""
+    """One camera made of several that follow the same pulses; columns without an image are dark."""
 
-    def __init__(self, given: SideBySideOpener) -> None:
-        self._given = given
-        self._parts: list[SimulatedCamera] = [opener() for opener in given.openers]
+    def __init__(self, opener: SideBySideOpener) -> None:
+        self._opener = opener
+        self._parts: list[SimulatedCamera] = [part() for part in opener.openers]
         self._ready: list[CameraBlock] = []
 
     def identify(self) -> CameraIdentity:
         return self._parts[0].identify()
 
     def settings(self) -> dict[str, Any]:
-        return self._parts[0].settings() | {"Width": self._given.width, "SensorWidth": self._given.width}
+        return self._parts[0].settings() | {"Width": self._opener.width, "SensorWidth": self._opener.width}
 
     def arm(self) -> None:
         self._ready.clear()
@@ -49,7 +49,8 @@ class SideBySide:
             part.arm_like(first)
 
     def next_block(self, timeout_s: float) -> CameraBlock | None:
-        """As long as the shortest of the parts'; a part that has come waits for the others."""
+        """Return a block once every part has delivered its own; it is as long as the first part's."""
+        # A block that arrived before a timeout of another part is kept for the next call.
         for part in self._parts[len(self._ready) :]:
             block = part.next_block(timeout_s)
             if block is None:
@@ -57,8 +58,8 @@ class SideBySide:
             self._ready.append(block)
         blocks, self._ready = self._ready, []
         count = len(blocks[0].flags)
-        pixels: NDArray[Any] = np.zeros((count, self._given.width), blocks[0].pixels.dtype)
-        for first, block in zip(self._given.first_columns, blocks, strict=True):
+        pixels: NDArray[Any] = np.zeros((count, self._opener.width), blocks[0].pixels.dtype)
+        for first, block in zip(self._opener.first_columns, blocks, strict=True):
             pixels[:, first : first + block.pixels.shape[1]] = block.pixels[:count]
         return CameraBlock(blocks[0].first_line, pixels, blocks[0].flags)
 
@@ -66,7 +67,7 @@ class SideBySide:
         return self._parts[0].times_ns(first_line, count)
 
     def release(self, block: CameraBlock) -> None:
-        """Nothing to give back."""
+        """Do nothing: every block has its own memory."""
 
     def disarm(self) -> None:
         for part in self._parts:

@@ -1,9 +1,9 @@
 """Simulated cameras: the same protocol as the real ones, at the end of a simulated trigger's wire.
 
-The trigger (`acquire.sim.trigger_model`) only writes its pulse train there. A camera reads it, waits until
-the pulses of its next block have been issued and computes those lines from scene and code; the light's code
-comes with the pulses, as it does on the bench. A camera that computes more slowly than the pulses come is no
-camera that loses lines: the queue behind it has no end, it is merely late (``behind_lines``).
+The trigger (`acquire.sim.trigger_model`) only writes its pulse train to the wire. A camera reads it, waits
+until the pulses of its next block have been issued and computes those lines from scene and code; the light's
+code comes with the pulses, as it does on the bench. A camera that computes more slowly than the pulses come
+loses no lines: its queue of pulses is unlimited, and it is merely late (``behind_lines``).
 """
 
 from __future__ import annotations
@@ -23,8 +23,6 @@ from acquire.lines import ARMS
 from acquire.processes import nursery
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
-
     from numpy.typing import NDArray
 
     from acquire.codes import Code
@@ -39,25 +37,25 @@ if TYPE_CHECKING:
 
 
 class Sensor(Protocol):
-    """Gives lines by their numbers."""
+    """Returns lines by their numbers."""
 
     def read(self, first_line: int, count: int) -> Readout: ...
 
 
 class Optics(Protocol):
-    """What stands in front of a simulated sensor."""
+    """The source of a simulated sensor's lines."""
 
     @property
     def geometry(self) -> GeometryConfig: ...
 
     def expose(self, train: PulseTrain, code: Code, config: CameraConfig) -> Sensor:
-        """The lines that the camera gives under a train's timing and the light's code."""
+        """Return the camera's lines under a train's timing and the light's code."""
         ...
 
 
 @dataclass(frozen=True, slots=True)
 class SimulatedOptics:
-    """What stands in front of a simulated sensor: which arm, how large, which scene."""
+    """The optics before a simulated sensor: the arm, the geometry, the scene and the fibre, if any."""
 
     arm: str
     geometry: GeometryConfig
@@ -69,8 +67,8 @@ class SimulatedOptics:
         return self.geometry.stages if self.fibre is None else self.fibre.sensor_pixels
 
     def expose(self, train: PulseTrain, code: Code, config: CameraConfig) -> Camera:
-        """The lines that the arm's camera gives under a train's timing and the light's code."""
-        from acquire.sim.pipeline import Bench  # with scenes, which other optics do without
+        """Return the lines of the arm's camera under a train's timing and the light's code."""
+        from acquire.sim.pipeline import Bench  # imports scenes, which other optics do not need
 
         substep_s = float(train.line_period_ns / (self.geometry.substeps * NS_PER_S))
         cameras = dict.fromkeys(ARMS, config)
@@ -90,8 +88,8 @@ class SimulatedCamera:
     """A TDI camera that reads out one line per pulse on the wire, in blocks of ``block_lines``.
 
     It follows one train: the one that runs when it is armed, else the next one. Its line at pulse ``p`` is
-    line number ``p − (M + 1)``. What its lines hold is said in `acquire.sim.pipeline`; lines that an effect
-    drops are jumped over in its count. ``line_rate_hz`` is what it was set up for; the pulses alone decide.
+    line number ``p − (M + 1)``. `acquire.sim.pipeline` computes its lines; its line count skips those that
+    an effect drops. ``line_rate_hz`` is only reported as a setting: the pulses alone set the rate.
     """
 
     def __init__(
@@ -116,7 +114,7 @@ class SimulatedCamera:
         return CameraIdentity("acquire", "simulated TDI camera", self._config.serial, __version__)
 
     def settings(self) -> dict[str, Any]:
-        # optics of plug-ins that know nothing of fibres have as many pixels as stages
+        # Optics of plug-ins that predate fibres have no ``pixels``: one pixel per stage.
         pixels = getattr(self._optics, "pixels", self._optics.geometry.stages)
         return {
             "DeviceScanType": "Linescan",
@@ -136,7 +134,7 @@ class SimulatedCamera:
         }
 
     def arm(self) -> None:
-        # As with a real one: armed while pulses come, it counts from the next of them.
+        # Like a real camera, one that is armed during a train counts from the next pulse.
         reading = self._wire.read()
         self._train = reading.run if reading.running else reading.run + 1
         self._first_pulse = reading.issued if reading.running else 0
@@ -145,21 +143,21 @@ class SimulatedCamera:
         self._light = None
 
     def arm_like(self, other: SimulatedCamera) -> None:
-        """Be armed from the same pulse on as ``other``, just armed: both are one sensor."""
+        """Arm from the same pulse as ``other``, which was just armed: both are parts of one sensor."""
         self._train, self._first_pulse = other._train, other._first_pulse
         self._delivered = self._lost = 0
         self._ready.clear()
         self._light = None
 
     def next_block(self, timeout_s: float) -> CameraBlock | None:
-        """The next ``block_lines`` lines; fewer only for the last of a train that was stopped."""
+        """Return the next ``block_lines`` lines; only the last block of a stopped train is shorter."""
         if self._train is None:
-            raise CameraError("a block was requested of a camera that is not armed", hint="arm it")
+            raise CameraError("a block was requested from a camera that is not armed", hint="arm it")
         if self._ready:
             return self._ready.popleft()
         reading = self._wire.read()
         if reading.run == self._train and reading.stopped and not self._behind(reading):
-            self._wire.clock.sleep(timeout_s)  # a camera that waits for triggers that will not come
+            self._wire.clock.sleep(timeout_s)  # as a real camera waits for triggers that will not come
             return None
         pulses = self._first_pulse + self._delivered + self._block_lines
         reading = self._wire.wait(self._train, pulses, timeout_s)
@@ -169,19 +167,20 @@ class SimulatedCamera:
         return self._read_out(reading, ready)
 
     def times_ns(self, first_line: int, count: int) -> NDArray[np.int64]:
-        """CLOCK_MONOTONIC at which lines, counted since arm, were triggered (count,)."""
+        """Return CLOCK_MONOTONIC of the triggers of lines, which are counted since arming: (count,)."""
         train = self._wire.read().train
         if train is None or train.run != self._train:
-            raise CameraError("times were asked of a camera without its pulses")
+            raise CameraError("line times were requested from a camera that has seen no pulses of its train")
         spacing = train.line_period_ns / train.speed
         pulses = self._first_pulse + first_line + np.arange(count, dtype=np.int64)
+        # Whole nanoseconds and the rest separately: pulses · numerator would overflow 64 bits.
         whole, rest = divmod(spacing.numerator, spacing.denominator)
-        late = pulses * whole - (-pulses * rest // spacing.denominator)  # the product as it is would overflow
-        times: NDArray[np.int64] = train.start_ns + late
+        elapsed_ns = pulses * whole - (-pulses * rest // spacing.denominator)
+        times: NDArray[np.int64] = train.start_ns + elapsed_ns
         return times
 
     def release(self, block: CameraBlock) -> None:
-        """Nothing to give back: every block has memory of its own."""
+        """Do nothing: every block has its own memory."""
 
     def disarm(self) -> None:
         self._train = None
@@ -194,7 +193,7 @@ class SimulatedCamera:
         self.disarm()
 
     def _behind(self, reading: Reading) -> int:
-        """Lines that are due and not delivered; CameraError when another train has taken the wire."""
+        """Return the lines due but not delivered. Raises CameraError once another train has started."""
         assert self._train is not None
         if reading.run > self._train:
             raise CameraError(
@@ -206,7 +205,7 @@ class SimulatedCamera:
         return reading.issued - self._first_pulse - self._delivered
 
     def _read_out(self, reading: Reading, count: int) -> CameraBlock | None:
-        # Not when it is armed: code and timing come with the pulses.
+        # The sensor is set up here and not in `arm`, because code and timing come with the pulses.
         if self._light is None:
             assert reading.train is not None
             code = self._wire.code(reading.train)
@@ -218,23 +217,22 @@ class SimulatedCamera:
             block = CameraBlock(self._delivered, lines.pixels, np.zeros(count, np.uint16), time_ns=time_ns)
             self._delivered += count
             return block
+        # A block holds consecutive lines only: one for each range between missing lines.
+        first, times_ns = self._delivered, self.times_ns(self._delivered, count)
+        edges = np.flatnonzero(np.diff(lines.missing, prepend=True, append=True))
+        for begin, end in edges.reshape(-1, 2).tolist():
+            flags = np.zeros(end - begin, np.uint16)
+            self._ready.append(
+                CameraBlock(first + begin, lines.pixels[begin:end], flags, time_ns=int(times_ns[begin]))
+            )
         self._lost += int(lines.missing.sum())
-        self._ready.extend(_whole_runs(self._delivered, lines, self.times_ns(self._delivered, count)))
         self._delivered += count
         return self._ready.popleft() if self._ready else None
 
 
-def _whole_runs(first: int, lines: Readout, times_ns: NDArray[np.int64]) -> Iterator[CameraBlock]:
-    """The stretches between lines that did not come."""
-    edges = np.flatnonzero(np.diff(lines.missing, prepend=True, append=True))
-    for begin, end in edges.reshape(-1, 2).tolist():
-        flags = np.zeros(end - begin, np.uint16)
-        yield CameraBlock(first + begin, lines.pixels[begin:end], flags, time_ns=int(times_ns[begin]))
-
-
 @dataclass(frozen=True, slots=True)
 class SimulatedCameraOpener:
-    """Opens one simulated camera in the process that calls it; can be given to a process being spawned."""
+    """Opens one simulated camera in the calling process; can be passed to a process being spawned."""
 
     wire: Wire | PinWire
     optics: SimulatedOptics
@@ -244,5 +242,5 @@ class SimulatedCameraOpener:
 
     def __call__(self) -> SimulatedCamera:
         if nursery.is_worker():
-            limit_blas(1)  # the cores are for the capture path
+            limit_blas(1)  # the other cores belong to the capture path
         return SimulatedCamera(self.wire, self.optics, self.config, self.block_lines, self.line_rate_hz)

@@ -1,4 +1,4 @@
-"""Seven-segment displays whose digits come and go (Fig. 10).
+"""Seven-segment displays whose digits fade in and out (Fig. 10).
 
 ::
 
@@ -8,7 +8,7 @@
      e   c
       ─d─
 
-A segment is a source of its own: its intensity is the sum of the triangles of the digits that light it.
+Each segment is one source: its intensity is the sum of the triangles of the digits that light it.
 """
 
 from __future__ import annotations
@@ -41,21 +41,21 @@ _PLACES = {
     "f": (_STROKE, 0.0, 0.5 - 1.5 * _STROKE, _STROKE),
     "g": (0.5 - _STROKE / 2, _STROKE, _STROKE, _WIDTH - 2 * _STROKE),
 }
-"""Segment → top, left, height, width, in heights of the digit from its corner."""
+"""Segment → top, left, height, width, from the digit's corner, in units of its height."""
 
 
 class DisplayConfig(FrozenModel):
-    """One seven-segment display: a digit per period, its intensity a triangle 0 → 1 → 0."""
+    """One seven-segment display: one digit per period, with an intensity that is a triangle 0 → 1 → 0."""
 
-    digits: str = Field(pattern=r"^[0-9]+$", description="shown one after the other, in a loop")
+    digits: str = Field(pattern=r"^[0-9]+$", description="shown one after another, in a loop")
     row: Fraction = 0.5
     column: Fraction
-    height: float = Field(default=0.7, gt=0, le=1, description="of the digit; it is 0.58 as wide")
-    phase_deg: float = Field(default=0.0, description="of the display's period")
+    height: float = Field(default=0.7, gt=0, le=1, description="height of the digit; its width is 0.58 of it")
+    phase_deg: float = Field(default=0.0, description="phase in degrees of the display's period")
 
 
 class DigitsSceneConfig(SceneModel):
-    """Seven-segment displays whose digits come and go with triangular intensity (Fig. 10)."""
+    """Seven-segment displays whose digits fade in and out with triangular intensity (Fig. 10)."""
 
     kind: Literal["digits"]
     period_s: float = Field(default=1.28e-3, gt=0)
@@ -66,7 +66,7 @@ class DigitsSceneConfig(SceneModel):
 
 
 class DigitScene(MaskScene):
-    """Displays side by side; ``period_s`` is what one digit lasts."""
+    """Displays side by side; ``period_s`` is the duration of one digit."""
 
     def __init__(
         self, displays: tuple[DisplayConfig, ...], period_s: float, size: int, substep_s: float
@@ -78,7 +78,7 @@ class DigitScene(MaskScene):
         self.masks = np.stack([_segment(display, name, size) for display, name in self.segments])
 
     def intensity(self, first: int, count: int, substep_s: float | None = None) -> NDArray[np.float64]:
-        """(K, count), K segments."""
+        """Return the intensity of each of the K segments: (K, count)."""
         step = (substep_s or self._substep_s) / self._period_s
         light = {display: _digit_light(display, first, count, step) for display in self._displays}
         return np.stack(
@@ -87,15 +87,19 @@ class DigitScene(MaskScene):
 
 
 def _shows(display: DisplayConfig, name: str) -> NDArray[np.bool_]:
-    """(digit): whether the display's digits light the segment."""
+    """Return for each of the display's digits whether it lights the segment: (digit,)."""
     return np.array([name in SEGMENTS[int(digit)] for digit in display.digits])
 
 
 def _digit_light(display: DisplayConfig, first: int, count: int, step: float) -> NDArray[np.float64]:
-    """(digit, count): mean light over each sub-step of the triangle of every digit of the loop."""
+    """Return the mean light of every digit of the loop over each sub-step: (digit, count).
+
+    ``step`` is the duration of a sub-step in periods of a digit.
+    """
     loop = len(display.digits)
     begin = phase(first, count, step / loop, display.phase_deg / loop) * loop
     at = begin - np.arange(loop)[:, None]
+    # A sub-step may reach into the next loop, and may be longer than a whole one.
     rounds = range(int(np.ceil(step / loop)) + 1)
     area = sum(
         triangle_within(at + step - turn * loop) - triangle_within(at - turn * loop) for turn in rounds
@@ -105,6 +109,7 @@ def _digit_light(display: DisplayConfig, first: int, count: int, step: float) ->
 
 
 def _segment(display: DisplayConfig, name: str, size: int) -> NDArray[np.float32]:
+    """Return the fraction of each pixel that the segment covers: (size, size)."""
     top, left, height, width = (display.height * length for length in _PLACES[name])
     top += display.row - display.height / 2
     left += display.column - display.height * _WIDTH / 2

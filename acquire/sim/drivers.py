@@ -1,4 +1,4 @@
-"""The drivers of simulated devices. What computes is imported when a rig opens one."""
+"""The drivers of simulated devices. The simulation itself is imported when a rig opens one."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 
 class SimulatedCameras(CameraVariant):
-    """Lines computed from the scene, in the process that takes them."""
+    """Lines computed from the scene, in the process that captures them."""
 
     simulated: ClassVar[bool] = True
     sees_scene: ClassVar[bool] = True
@@ -30,7 +30,7 @@ class SimulatedCameras(CameraVariant):
 
 
 class PatternCameras(CameraVariant):
-    """Stored lines in place of the scene, at any rate, for loads."""
+    """Stored lines in place of a scene, at any rate, for load tests."""
 
     simulated: ClassVar[bool] = True
     sees_light: ClassVar[bool] = False
@@ -40,7 +40,7 @@ class PatternCameras(CameraVariant):
 
 
 class GentlCameras(CameraVariant):
-    """Simulated cameras behind a GenTL producer of ours, through harvesters."""
+    """Simulated cameras behind the project's own GenTL producer, driven through harvesters."""
 
     simulated: ClassVar[bool] = True
     sees_scene: ClassVar[bool] = True
@@ -50,7 +50,7 @@ class GentlCameras(CameraVariant):
 
 
 class GigeCameras(CameraVariant):
-    """Simulated cameras behind a GigE Vision port of ours, through Aravis."""
+    """Simulated cameras behind the project's own GigE Vision port, driven through Aravis."""
 
     simulated: ClassVar[bool] = True
     sees_scene: ClassVar[bool] = True
@@ -65,9 +65,9 @@ class SimulatedTrigger(GatewareTrigger):
     simulated: ClassVar[bool] = True
 
     def transport(self, config: RigConfig, bench: SimulatedDevices | None) -> Callable[[], Transport]:
-        from acquire.sim.instrument import lonely_transport
+        from acquire.sim.instrument import unconnected_transport
 
-        return lonely_transport(config) if bench is None else bench.transport()
+        return unconnected_transport(config) if bench is None else bench.transport()
 
     def possible(self, trigger: TriggerConfig) -> Capabilities:
         from acquire.sim.trigger_registers import INPUTS
@@ -76,7 +76,7 @@ class SimulatedTrigger(GatewareTrigger):
 
 
 class CompiledTrigger(SimulatedTrigger):
-    """The gateware itself, compiled, with the pins that its cameras see."""
+    """The gateware itself, compiled, with pins that the simulated cameras read."""
 
     def bytes_per_s(self, trigger: TriggerConfig) -> float:
         from acquire.sim import rtl

@@ -1,8 +1,8 @@
-"""Light of a driven source, as means over sub-steps: exact, whatever the frequency.
+"""Light of a driven source, as exact means over sub-steps at any frequency.
 
-The value at the middle of a sub-step would overrate fast drives: at 5 kHz and 10 µs by 0.4 %, at a whole
-period per sub-step by everything. Whole cycles are dropped before anything is computed: arguments stay
-small, and hours into a run the phase is still good to 1e-6.
+The value at the middle of a sub-step would overestimate the modulation of fast drives: by 0.4 % at 5 kHz and
+10 µs, and entirely at one period per sub-step. Whole cycles are dropped before anything is computed, so that
+arguments stay small and the phase is still accurate to 1e-6 hours into a run.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 
 def mean_drive(drive: Drive, first: int, count: int, substep_s: float) -> NDArray[np.float64]:
-    """Mean of a drive over sub-steps ``first … first + count - 1``: (count,)."""
+    """Return the mean of a drive over each of the sub-steps ``first … first + count - 1``: (count,)."""
     if isinstance(drive, ConstantDrive):
         return np.full(count, drive.level)
     step = drive.frequency_hz * substep_s
@@ -40,31 +40,33 @@ def mean_drive(drive: Drive, first: int, count: int, substep_s: float) -> NDArra
 
 
 def phase(first: int, count: int, cycles_per_substep: float, phase_deg: float) -> Phase:
-    """Phase at the beginning of each sub-step, in cycles, 0 to 1."""
+    """Return the phase at the beginning of each sub-step, in cycles from 0 to 1."""
     substep = np.arange(first, first + count)
     cycles: Phase = (substep * cycles_per_substep + phase_deg / 360) % 1.0
     return cycles
 
 
 def mean_over(area: Callable[[Phase], Phase], begin: Phase, length: float) -> Phase:
-    """Mean over begin … begin + length of the function whose integral from 0 is ``area``."""
+    """Return the mean over begin … begin + length of the function whose integral from 0 is ``area``."""
     return (area(begin + length) - area(begin)) / length
 
 
 def triangle_within(x: Phase) -> Phase:
-    """Integral from 0 to x of one triangle 0 → 1 → 0 on 0 … 1, nothing outside."""
+    """Return the integral from 0 to x of a single triangle 0 → 1 → 0 on 0 … 1."""
     inside = np.clip(x, 0, 1)
     area: Phase = np.where(inside < 0.5, inside**2, 0.5 - (1 - inside) ** 2)
     return area
 
 
 def _triangle_area(x: Phase) -> Phase:
+    """Return the integral from 0 to x of a triangle wave of period 1."""
     whole = np.floor(x)
     area: Phase = whole / 2 + triangle_within(x - whole)
     return area
 
 
 def _pulse_area(x: Phase, duty: float) -> Phase:
+    """Return the integral from 0 to x of a pulse wave of period 1 that is on for its first ``duty``."""
     whole = np.floor(x)
     area: Phase = whole * duty + np.minimum(x - whole, duty)
     return area

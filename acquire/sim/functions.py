@@ -1,4 +1,4 @@
-"""Scenes that a user writes as a Python function of time and place."""
+"""Scenes that a user writes as a Python function of time and position."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ if TYPE_CHECKING:
 
 
 class FunctionSceneConfig(SceneModel):
-    """A Python function of the user: (time_s (k,), row (n, 1), column (n,)) → light (k, n, n).
+    """A user's Python function: (time_s (k,), row (n, 1), column (n,)) → light (k, n, n).
 
-    Rows and columns are the pixels' centres, 0 to 1. ``file.py:name`` is relative to the scene file.
+    Rows and columns are the centres of the pixels, 0 to 1. ``file.py:name`` is relative to the scene file.
     """
 
     kind: Literal["function"]
@@ -43,8 +43,8 @@ class FunctionSceneConfig(SceneModel):
 class FunctionScene:
     """``function(time_s, row, column)`` → light (count, n, n), at the middle of sub-steps and pixels.
 
-    Raises UsageError when the function gives another shape, something that is not finite, or negative light;
-    it is tried for one sub-step when the scene is made.
+    Raises UsageError if the function returns another shape, values that are not finite, or negative light.
+    It is called for one sub-step when the scene is made, so that errors show early.
     """
 
     def __init__(self, function: LightFunction, size: int, substep_s: float) -> None:
@@ -66,22 +66,26 @@ class FunctionScene:
 
 
 def checked_light(light: Any, shape: tuple[int, ...], what: str) -> NDArray[np.float32]:
-    """Light as float32 of ``shape``; UsageError for what is none."""
+    """Return light as float32 of ``shape``. Raises UsageError for anything else."""
     try:
         frames = np.asarray(light, dtype=np.float32)
     except (TypeError, ValueError) as error:
-        raise UsageError(f"light of {what} is no array of numbers: {error}") from error
+        raise UsageError(f"the light of {what} is not an array of numbers: {error}") from error
     if frames.shape != shape:
-        raise UsageError(f"light of {what} has shape {frames.shape}", possible=f"{shape}")
+        raise UsageError(f"the light of {what} has shape {frames.shape}", possible=f"{shape}")
     if not np.isfinite(frames).all():
-        raise UsageError(f"light of {what}: {np.isnan(frames).sum()} pixels are NaN, or some infinite")
+        nan, infinite = int(np.isnan(frames).sum()), int(np.isinf(frames).sum())
+        raise UsageError(f"the light of {what} is not finite: {nan} pixels are NaN, {infinite} infinite")
     if frames.size and frames.min() < 0:
-        raise UsageError(f"light of {what} goes down to {frames.min():g}", possible="0 or more")
+        raise UsageError(
+            f"the light of {what} must not be negative, and is as low as {frames.min():g}",
+            possible="0 or more",
+        )
     return frames
 
 
 def load_function(name: str) -> LightFunction:
-    """``module:name`` or ``file.py:name``. UsageError when there is none."""
+    """Import ``module:name`` or run ``file.py:name``. Raises UsageError if there is no such function."""
     place, _, attribute = name.rpartition(":")
     try:
         if place.endswith(".py"):
@@ -91,5 +95,5 @@ def load_function(name: str) -> LightFunction:
     except (ImportError, OSError, SyntaxError) as error:
         raise UsageError(f"scene function {name!r} cannot be loaded: {error}") from error
     if not callable(found):
-        raise UsageError(f"scene function {name!r}: {place} has no function {attribute}")
+        raise UsageError(f"scene function {name!r} cannot be loaded: {place} has no function {attribute}")
     return found  # type: ignore[no-any-return]

@@ -1,7 +1,7 @@
-"""The simulated devices of a rig: a trigger, the cameras that it pulses, and what these look at.
+"""The simulated devices of a rig: a trigger, the cameras that it pulses, and the scene before them.
 
-Made where a rig has a simulated device, and imported only there. Cameras see the trigger's pulses on a wire,
-or on the pins of the compiled gateware.
+This module is imported only if a rig has a simulated device. Cameras see the trigger's pulses on a wire, or
+on the pins of the compiled gateware.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ if TYPE_CHECKING:
 
 
 class SimulatedDevices:
-    """See the module. Reads the scene, if a camera sees one, and touches no device.
+    """The simulated devices of one rig. Reads the scene, if a camera sees one, and opens no device.
 
     Raises ConfigError for files and values, UsageError for a scene that cannot be shown to these cameras.
     """
@@ -47,26 +47,26 @@ class SimulatedDevices:
     def __init__(self, config: RigConfig) -> None:
         self.config = config
         self._scene: SceneConfig | None = None
-        self._read: tuple[int, int] | None = None
-        self._look_at_scene()
+        self._scene_version: tuple[int, int] | None = None
+        self._update_scene()
         self._wire = Wire()
         self._pins = PinPage() if config.trigger.driver == "rtl" else None
         self._gentl, self._gige = GentlArms(config), GigeArms(config)
 
     def transport(self) -> Callable[[], Transport]:
-        """What opens the way to the trigger."""
+        """Return the function that opens the connection to the trigger."""
         return _transport(self.config, self._wire, self._pins)
 
     def gentl(self, arm: str) -> CameraOpener:
-        """The arm's camera behind our GenTL producer. Raises DeviceError without a C compiler."""
+        """The arm's camera behind the simulated GenTL producer. Raises DeviceError without a C compiler."""
         return self._gentl.opener(arm, self.sensor)
 
     def gige(self, arm: str) -> CameraOpener:
-        """The arm's camera behind our GigE Vision port."""
+        """The arm's camera behind the simulated GigE Vision port."""
         return self._gige.opener(arm, self.sensor)
 
     def replay(self, arm: str) -> CameraOpener:
-        """A camera that gives the lines of the recording to be replayed."""
+        """A camera that repeats the lines of the recording named by ``simulation.replay``."""
         simulation = self.config.simulation
         assert simulation.replay is not None
         return ReplayCameraOpener(
@@ -78,41 +78,43 @@ class SimulatedDevices:
             gate=simulation.replay_gate,
         )
 
-    def _look_at_scene(self) -> None:
-        """What is before the cameras now: a scene's file may change between runs, as what is on a bench does.
+    def _update_scene(self) -> None:
+        """Read the scene's file again if it has changed: it may change between runs, as a real bench does.
 
         Raises ConfigError and UsageError as the class does.
         """
         if not self.config.needs_scene:
             return
-        place = find(self.config.scene_file(), kind="scene").stat()
-        if self._read != (place.st_mtime_ns, place.st_ino):
+        file = find(self.config.scene_file(), kind="scene").stat()
+        version = (file.st_mtime_ns, file.st_ino)
+        if self._scene_version != version:
             scene = load_scene(self.config.scene_file())
             _check_scene(self.config, scene)
-            self._scene, self._read = scene, (place.st_mtime_ns, place.st_ino)
+            self._scene, self._scene_version = scene, version
 
     def sensor(self, arm: str) -> CameraOpener:
-        """The model of the arm's camera, in the process that opens it."""
-        parts = {arm: self._part(arm) for arm in ARMS}
-        columns = self.config.columns
+        """The model of the arm's camera, to be opened in any process."""
+        config = self.config
+        parts = {}
+        for name in ARMS:
+            self._update_scene()
+            assert self._scene is not None
+            parts[name] = SimulatedCameraOpener(
+                wire=self.pulses(name),
+                optics=SimulatedOptics(name, config.geometry, self._scene, config.laid_out),
+                config=config.cameras.arm(name),
+                block_lines=config.stream.block_lines,
+                line_rate_hz=config.line_rate_hz,
+            )
+        columns = config.columns
         if not columns:
             return parts[arm]
         return SideBySideOpener(
-            tuple(parts.values()), tuple(columns[arm][0] for arm in ARMS), sensor_width(self.config)
-        )
-
-    def _part(self, arm: str) -> SimulatedCameraOpener:
-        config = self.config
-        self._look_at_scene()
-        assert self._scene is not None
-        optics = SimulatedOptics(arm, config.geometry, self._scene, config.laid_out)
-        camera = config.cameras.arm(arm)
-        return SimulatedCameraOpener(
-            self.pulses(arm), optics, camera, config.stream.block_lines, config.line_rate_hz
+            tuple(parts.values()), tuple(columns[name][0] for name in ARMS), sensor_width(config)
         )
 
     def pattern(self, arm: str) -> CameraOpener:
-        """A camera with stored lines."""
+        """A camera that repeats stored lines."""
         config = self.config
         return PatternCameraOpener(
             wire=self.pulses(arm),
@@ -125,11 +127,11 @@ class SimulatedDevices:
         )
 
     def pulses(self, arm: str) -> Wire | PinWire:
-        """Where an arm's camera sees its trigger's pulses."""
+        """The wire, or the pins, on which an arm's camera sees its trigger's pulses."""
         return self._wire if self._pins is None else PinWire(self._pins, arm)
 
     def describe(self) -> dict[str, Any]:
-        """What a recording must say about where its lines come from (JSON)."""
+        """Return the origin of the lines, as a recording must state it (JSON)."""
         if self.config.simulation.replay is not None:
             return describe_replay(self.config.simulation.replay)
         if self._scene is not None:
@@ -138,7 +140,7 @@ class SimulatedDevices:
 
     @property
     def layout(self) -> str:
-        """How the instrument is laid out, as the cameras or the scene's optics have it."""
+        """The layout of the instrument, from the replayed recording, the cameras or the scene's optics."""
         if self.config.simulation.replay is not None:
             return str(open_recording(self.config.simulation.replay).attrs["layout"])
         if self.config.cameras.layout != "dual" or self._scene is None:
@@ -146,9 +148,9 @@ class SimulatedDevices:
         return self._scene.optics.layout
 
     def scene(self) -> Scene:
-        """What the cameras see, in camera A's rows and columns; sub-step 0 is the run's first.
+        """The scene that the cameras see, in camera A's rows and columns; sub-step 0 is the run's first.
 
-        Behind a fibre a square, in the middle of which the fibre's field lies (`acquire.fibre.Fibre.field`).
+        Behind a fibre it is the square around the fibre's field (`acquire.fibre.Fibre.field`).
         """
         trigger, geometry = self.config.trigger, self.config.geometry
         scene = self._scene or load_scene(self.config.scene_file())
@@ -157,24 +159,24 @@ class SimulatedDevices:
         return build_scene(scene, size, trigger.substep_ticks / trigger.clock_hz)
 
     def close_cameras(self) -> None:
-        """Take the cameras away that have processes of their own."""
+        """Remove the cameras that have their own processes."""
         self._gentl.close()
         self._gige.close()
 
     def close_wires(self) -> None:
-        """Take away what carries the trigger's pulses, once the trigger is closed."""
+        """Release the wire and the pins, once the trigger is closed."""
         self._wire.close()
         if self._pins is not None:
             self._pins.close()
 
 
-def lonely_transport(config: RigConfig) -> Callable[[], Transport]:
-    """What opens the way to a simulated trigger whose pulses nobody sees."""
+def unconnected_transport(config: RigConfig) -> Callable[[], Transport]:
+    """Return the function that opens a simulated trigger whose pulses reach no camera."""
     return _transport(config, Wire(), None)
 
 
 def _transport(config: RigConfig, wire: Wire, pins: PinPage | None) -> Callable[[], Transport]:
-    """To the trigger's model, or to the compiled gateware."""
+    """Return the function that opens the trigger's model, or the compiled gateware."""
     clock_hz = config.trigger.clock_hz
     if config.trigger.driver == "rtl":
         return partial(rtl.RtlTransport, clock_hz, pins)
@@ -182,7 +184,7 @@ def _transport(config: RigConfig, wire: Wire, pins: PinPage | None) -> Callable[
 
 
 def _check_scene(config: RigConfig, scene: SceneConfig) -> None:
-    """Raise UsageError here rather than in a camera's process."""
+    """Build each camera once, so that UsageError is raised here rather than in a camera's process."""
     if config.trigger.driver == "rtl" and any(effect.kind == "delays" for effect in scene.effects):
         raise UsageError(
             "effect 'delays' cannot act on the pins of the gateware", possible="trigger.driver = 'simulated'"

@@ -1,7 +1,7 @@
-"""Compiled loops of the simulation: what moves is drawn, and frames are added to lines.
+"""Compiled loops of the simulation: they draw moving objects and add frames to lines.
 
-Own kernels because numpy would pass over every frame several times: a frame of 192 × 192 pixels has to be
-drawn and added for both arms in 20 µs to keep up with the built setup.
+These are kernels because numpy would pass over every frame several times, and a frame of 192 × 192 pixels has
+to be drawn and added for both arms in 20 µs to keep up with the built setup.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 def add_along_rows(
     frames: NDArray[Any], light: NDArray[Any], newest: NDArray[Any], rows: NDArray[Any], out: NDArray[Any]
 ) -> None:
-    """out[newest[i] − rows[r], c] += light[i]·frames[i, r, c]: charge that moves along the scene's rows."""
+    """Add charge moving along the scene's rows: out[newest[i] − rows[r], c] += light[i]·frames[i, r, c]."""
     for i in range(frames.shape[0]):
         for r in range(frames.shape[1]):
             q = newest[i] - rows[r]
@@ -32,11 +32,11 @@ def add_along_rows(
 def add_along_columns(
     frames: NDArray[Any], light: NDArray[Any], oldest: NDArray[Any], out: NDArray[Any]
 ) -> None:
-    """out[r, oldest[i] + c] += light[i]·frames[i, r, c]: charge that moves from the last column to the first.
+    """Add charge moving from the last column to the first: out[r, oldest[i] + c] += light[i]·frames[i, r, c].
 
-    ``out`` is (row of the scene, packet of charge), so that both are walked in their order; a few frames at a
-    time, as many as the cache holds beside a row of packets. (Slices, because numba would otherwise ask of
-    every element whether its index is negative.)
+    ``out`` is (row of the scene, packet of charge), so that both arrays are traversed in memory order. Frames
+    are taken in groups small enough for the cache, next to a row of packets. Slices are used because numba
+    would otherwise check every index for being negative.
     """
     for chunk in range(0, frames.shape[0], 8):
         for r in range(frames.shape[1]):
@@ -57,10 +57,10 @@ def chop(
     blades: int,
     open_part: float,
 ) -> None:
-    """Multiply frames by the open part of each pixel; angles in turns, radius in pixels.
+    """Multiply frames by the open fraction of each pixel; angles are in turns, the radius in pixels.
 
-    The pitch of the wheel is 1/blades turn, of which ``open_part`` is open. An edge that passes within half a
-    pixel of a pixel's centre covers it in part.
+    The pitch of the wheel is 1/blades turn, of which ``open_part`` is open. An edge within half a pixel of a
+    pixel's centre covers the pixel in part.
     """
     for i in range(frames.shape[0]):
         for r in range(frames.shape[1]):
@@ -83,10 +83,10 @@ def paste(
     scale: float,
     reach: float,
 ) -> None:
-    """Draw a turned picture over frames, bilinear; ``place`` is (frame: row, column, cosine, sine) in pixels.
+    """Draw a rotated picture over frames with bilinear interpolation: frame ← frame·(1 − alpha) + picture.
 
-    ``scale`` is texels per pixel, ``reach`` how far the picture goes from its middle, in pixels.
-    frame ← frame·(1 − alpha) + picture, which is multiplied by its alpha.
+    ``picture`` is premultiplied by ``alpha``. ``place`` holds row and column (pixels), cosine and sine for
+    each frame, ``scale`` is texels per pixel, ``reach`` the picture's extent from its centre in pixels.
     """
     n, side = frames.shape[1], picture.shape[0]
     for i in range(frames.shape[0]):
@@ -110,10 +110,10 @@ def paste(
 
 @numba.njit(cache=True, nogil=True)
 def follow(target: NDArray[Any], rise: float, fall: float, level: NDArray[Any], out: NDArray[Any]) -> None:
-    """A first-order lag per source: mean over each step of light that follows its target; (K, count).
+    """Compute the mean over each step of light that follows its target with a first-order lag: (K, count).
 
-    ``rise`` and ``fall`` are time constants in steps; ``level`` (K) is the light at the beginning, and then
-    at the end.
+    ``rise`` and ``fall`` are time constants in steps; ``level`` (K,) is the light at the beginning, and is
+    updated to the light at the end.
     """
     for k in range(target.shape[0]):
         for t in range(target.shape[1]):

@@ -1,4 +1,4 @@
-"""LEDs behind masks, each with a drive of its own (Fig. 9)."""
+"""LEDs behind masks, each with its own drive (Fig. 9)."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 
 _EDGE = 2
-"""Pixels by which a shape's smooth edge can reach over its square."""
+"""Pixels by which a shape's smooth edge can extend beyond its bounding square."""
 
 
 class LedConfig(FrozenModel):
@@ -33,7 +33,7 @@ class LedConfig(FrozenModel):
     saturation: float | None = Field(
         default=None,
         gt=0,
-        description="drive at which the LED gives 1 − 1/e of its asymptote; absent: linear",
+        description="drive at which the LED reaches 1 − 1/e of its asymptote; absent: linear",
     )
 
 
@@ -47,7 +47,7 @@ class LedSceneConfig(SceneModel):
     def _names_differ(self) -> LedSceneConfig:
         names = [led.name for led in self.leds]
         if len(set(names)) < len(names):
-            raise ValueError(f"LEDs need different names, not {', '.join(names)}")
+            raise ValueError(f"LEDs must have different names, not {', '.join(names)}")
         return self
 
     def build(self, size: int, substep_s: float) -> LedScene:
@@ -63,7 +63,7 @@ class LedScene(MaskScene):
 
     Parameters
     ----------
-    leds : shapes, places and drives
+    leds : shapes, positions and drives
     size : n, rows and columns of the scene
     substep_s : duration of a sub-step in seconds of simulated time
     """
@@ -72,37 +72,30 @@ class LedScene(MaskScene):
         self.leds = leds
         self.substep_s = substep_s
         self.masks = np.zeros((len(leds), size, size), np.float32)
+        centre = (np.arange(size) + 0.5) / size
         for mask, led in zip(self.masks, leds, strict=True):
-            _draw(led, mask)
+            # Only the square around the shape is computed: the rest of the mask's memory stays untouched.
+            rows, columns = _extent(led.row, led.size, size), _extent(led.column, led.size, size)
+            row, column = (centre[rows] - led.row) / led.size, (centre[columns] - led.column) / led.size
+            pixel = 1 / (led.size * size)
+            mask[rows, columns] = coverage(led.shape, row[:, None], column[None, :], pixel=pixel)
 
     def intensity(self, first: int, count: int, substep_s: float | None = None) -> NDArray[np.float64]:
-        """(K, count): light of each LED, mean over each sub-step."""
+        """Return the mean light of each LED over each sub-step: (K, count)."""
         return np.stack([_light(led, first, count, substep_s or self.substep_s) for led in self.leds])
 
 
-def _draw(led: LedConfig, mask: NDArray[np.float32]) -> None:
-    """(row, column): how far each pixel of the scene is covered by the LED's shape, 0 to 1.
-
-    Only the square around the shape is computed: elsewhere memory is not even touched.
-    """
-    size = len(mask)
-    rows, columns = _extent(led.row, led.size, size), _extent(led.column, led.size, size)
-    centre = (np.arange(size) + 0.5) / size
-    row, column = (centre[rows] - led.row) / led.size, (centre[columns] - led.column) / led.size
-    mask[rows, columns] = coverage(led.shape, row[:, None], column[None, :], pixel=1 / (led.size * size))
-
-
 def _extent(centre: float, side: float, size: int) -> slice:
-    """Pixels along one axis that a shape may cover, its smooth edge included."""
+    """Return the pixels along one axis that a shape may cover, including its smooth edge."""
     first, last = (centre - side / 2) * size, (centre + side / 2) * size
     return slice(max(0, int(first) - _EDGE), min(size, int(last) + 1 + _EDGE))
 
 
 def _light(led: LedConfig, first: int, count: int, substep_s: float) -> NDArray[np.float64]:
-    """Light of an LED from its duty cycle d: d, or a·(1 − exp(−d/a)) when it saturates at a.
+    """Return the light of an LED with duty cycle d: d, or a·(1 − exp(−d/a)) if it saturates at a.
 
-    For small d both are d; the saturating LED never exceeds a and gives (1 − 1/e)·a at d = a. Saturation
-    acts on the mean over the sub-step: the driver smoothes the PWM long before the LED sees it.
+    For small d both are d; the saturating LED never exceeds a and emits (1 − 1/e)·a at d = a. Saturation
+    acts on the mean over the sub-step, because the driver smooths the PWM well before it reaches the LED.
     """
     duty = mean_drive(led.drive, first, count, substep_s)
     if led.saturation is None:

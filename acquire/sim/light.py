@@ -1,12 +1,12 @@
-"""The light that sources give: the exposure code AND each source's own drive.
+"""The light of the sources: the exposure code AND each source's own drive.
 
 ::
 
     code bits (t) ──────┐
-                         ×──▶ light (k, t) ──▶ what the effects of the sources make of it
+                         ×──▶ light (k, t) ──▶ the effects on the sources
     drives (k, t) ──────┘
 
-A scene of K driven masks has K sources; any other scene stands in the light of a single one.
+A scene of K driven masks has K sources; any other scene is lit by a single one.
 """
 
 from __future__ import annotations
@@ -31,10 +31,10 @@ Series = Callable[[int, int], "NDArray[Any]"]
 
 @dataclass(frozen=True, slots=True)
 class Illumination:
-    """Light of K sources, asked for by stretches of sub-steps.
+    """Light of K sources, evaluated over ranges of sub-steps.
 
-    ``bits`` (count,) is what of the code reaches the sources, ``drives`` (K, count) what each of them would
-    give, ``light`` (K, count) what they give.
+    ``bits`` (count,) is the code as it reaches the sources, ``drives`` (K, count) the light that each source
+    would emit without the code, and ``light`` (K, count) the light that it does emit.
     """
 
     bits: Series
@@ -43,17 +43,18 @@ class Illumination:
 
     @classmethod
     def of(cls, scene: Scene, code: Code) -> Illumination:
-        """Ideal sources: light = drive · bit."""
-        drives: Series = scene.intensity if isinstance(scene, SeparableScene) else _one_source
-        return cls.gated(code.bits, drives)
+        """Return ideal sources: light = drive · bit."""
+        if isinstance(scene, SeparableScene):
+            return cls.gated(code.bits, scene.intensity)
+        return cls.gated(code.bits, lambda _first, count: np.ones((1, count)))  # one source, always on
 
     @classmethod
     def gated(cls, bits: Series, drives: Series) -> Illumination:
-        """Code AND drive."""
+        """Return sources whose light is code AND drive."""
         return cls(bits, drives, lambda first, count: drives(first, count) * bits(first, count))
 
     def on_for(self, part: float) -> Illumination:
-        """The same sources, on for a part of every lit sub-step."""
+        """Return the same sources, on for the fraction ``part`` of every lit sub-step."""
         if part == 1:
             return self
         whole = self.light
@@ -61,9 +62,9 @@ class Illumination:
 
 
 class Tiled:
-    """A series computed by tiles at fixed places, so that nothing depends on how it is asked for.
+    """A series computed in tiles at fixed positions, so that values do not depend on the split into calls.
 
-    The last tiles are kept for the call that continues in them.
+    The most recent tiles are kept, because the next call usually continues in them.
     """
 
     def __init__(self, compute: Series, length: int = 1024, kept: int = 4) -> None:
@@ -71,18 +72,13 @@ class Tiled:
         self._tiles: dict[int, NDArray[Any]] = {}
 
     def __call__(self, first: int, count: int) -> NDArray[Any]:
-        tiles = [self._tile(i) for i in range(first // self._length, (first + count - 1) // self._length + 1)]
+        tiles = []
+        for index in range(first // self._length, (first + count - 1) // self._length + 1):
+            if index not in self._tiles:
+                self._tiles[index] = self._compute(index * self._length, self._length)
+                while len(self._tiles) > self._kept:
+                    del self._tiles[next(iter(self._tiles))]  # the oldest
+            tiles.append(self._tiles[index])
         skip = first % self._length
         values: NDArray[Any] = np.concatenate(tiles, axis=-1)[..., skip : skip + count]
         return values
-
-    def _tile(self, index: int) -> NDArray[Any]:
-        if index not in self._tiles:
-            self._tiles[index] = self._compute(index * self._length, self._length)
-            while len(self._tiles) > self._kept:
-                del self._tiles[next(iter(self._tiles))]
-        return self._tiles[index]
-
-
-def _one_source(first: int, count: int) -> NDArray[Any]:  # noqa: ARG001  # a series
-    return np.ones((1, count))

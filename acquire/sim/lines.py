@@ -1,20 +1,20 @@
-"""Streaming forward simulation: the lines of one arm by Eq. (1), whichever are asked for, in bounded memory.
+"""Streaming forward simulation: any range of one arm's lines by Eq. (1), in bounded memory.
 
-A line sums the scene along the shear, ``t = S·ℓ + r + u`` with row r and ``u < S``; the arm that sees the
-scene turned is the same sum over the turned scene. Light need not be on or off: E says how
-bright it is. Two ways, chosen by the scene:
+A line sums the scene along the shear, ``t = S·ℓ + r + u`` with row r and ``u < S``; for the arm that sees the
+scene rotated it is the same sum over the rotated scene. Light need not be on or off: E is its brightness.
+There are two methods, and the scene selects one:
 
 `SeparableLines`   X = Σ_k s_k(t)·mask_k. With h_k(t) = Σ_u s_k(t + u)·E(t + u) the sum over u and time is
-                   done once per LED, and a line is a matrix product of a window that slides by S::
+                   done once per LED, and a line is the matrix product with a window that slides by S::
 
                        Y(ℓ, j) = Σ_k Σ_r h_k(S·ℓ + r) · W_k(r, j)       W_k = mask_k, S columns per pixel
 
-`FrameLines`       any scene, frame by frame: row r of the frame at t belongs to the fine packet of charge
-                   q = t − r alone, and line ℓ is made of the packets S·ℓ … S·ℓ + S − 1. Packets that are
-                   not whole yet are carried to the next call.
+`FrameLines`       any scene, frame by frame: row r of the frame at t belongs only to the fine packet of
+                   charge q = t − r, and line ℓ consists of the packets S·ℓ … S·ℓ + S − 1. Incomplete
+                   packets are carried over to the next call.
 
-Both give bit for bit the same lines however the stream is split into calls: the first computes whole tiles
-at fixed places, the second adds in the order of time.
+Both return bit-identical lines however the stream is split into calls: the first computes whole tiles at
+fixed positions, the second adds in the order of time.
 """
 
 from __future__ import annotations
@@ -39,11 +39,11 @@ if TYPE_CHECKING:
     from acquire.sim.scene import Scene
 
 TILE_LINES = 256
-"""Lines of one matrix product: enough for BLAS, few enough for the cache (windows of 0.3 MB at n = 192)."""
+"""Lines per matrix product: enough for BLAS, few enough for the cache (windows of 0.3 MB at n = 192)."""
 _BLOCK_BYTES = 8 << 20
-"""Frames of a scene held at once."""
+"""Size of the block of frames held in memory."""
 _GATHERED_LINES = 512
-"""Lines whose packets are summed at once."""
+"""Lines whose packets are summed together."""
 
 
 class StreamingArm:
@@ -52,16 +52,16 @@ class StreamingArm:
     Parameters
     ----------
     scene : of size n = M·S
-    code : E, dark before sub-step 0; or light of which the code is a part
+    code : E, dark before sub-step 0; or light that already includes the code
     stages, substeps : M and S
-    arm : "a", or "b", which sees the scene turned by 90° counter-clockwise
-    optics : how the arm sees the scene, if it is not that
-    fibre : that lays out what lies in the middle of a larger scene, instead of optics; None: there is none
+    arm : "a", or "b", which sees the scene rotated by 90° counter-clockwise
+    optics : the arm's view of the scene, if it differs from that
+    fibre : the fibre that lays out the middle of a larger scene, instead of optics; None: no fibre
 
     Raises
     ------
     UsageError
-        The scene is not M·S wide, or not what the fibre asks for, or there is no such arm.
+        The scene is not M·S wide, or not of the size that the fibre needs, or there is no such arm.
     """
 
     def __init__(
@@ -75,31 +75,28 @@ class StreamingArm:
         *,
         fibre: Fibre | None = None,
     ) -> None:
-        wanted = stages * substeps if fibre is None else fibre.side
-        if scene.size != wanted:
+        required = stages * substeps if fibre is None else fibre.side
+        if scene.size != required:
             raise UsageError(
                 f"a scene of size {scene.size} does not fit {stages} stages of {substeps} sub-steps",
-                possible=f"n = {wanted}",
+                possible=f"n = {required}",
             )
         if arm not in ARMS:
             raise UsageError(f"there is no arm {arm!r}", possible=", ".join(ARMS))
         optics = optics or getattr(OpticsConfig(), arm)
         light = code if isinstance(code, Illumination) else Illumination.of(scene, code)
-        seen_scene, width = scene, scene.size
-        if fibre is not None:  # which lays the scene out as the arm sees it: nothing is left to turn
-            seen_scene, width, optics = (
-                laid_out(scene, fibre, arm),
-                substeps * fibre.sensor_pixels,
-                ArmOptics(),
-            )
+        width = scene.size
+        if fibre is not None:  # it lays the scene out as the arm sees it, so that nothing is left to rotate
+            scene, optics = laid_out(scene, fibre, arm), ArmOptics()
+            width = substeps * fibre.sensor_pixels
         self._lines: _Lines = (
-            SeparableLines(seen_scene, light, substeps, optics)
-            if isinstance(seen_scene, SeparableScene)
-            else FrameLines(seen_scene, light, substeps, optics, width)
+            SeparableLines(scene, light, substeps, optics)
+            if isinstance(scene, SeparableScene)
+            else FrameLines(scene, light, substeps, optics, width)
         )
 
     def lines(self, first_line: int, count: int) -> NDArray[np.float32]:
-        """Y of lines ``first_line .. first_line + count - 1`` (count, M); numbers below 0 are preroll."""
+        """Return Y of lines ``first_line .. first_line + count - 1``, (count, M); preroll is below 0."""
         return self._lines.lines(first_line, count)
 
 
@@ -108,15 +105,15 @@ class _Lines(Protocol):
 
 
 class SeparableLines:
-    """Lines of a separable scene, by tiles; the last tile is kept for the call that continues in it."""
+    """Lines of a separable scene, in tiles; the last tile is kept, because the next call continues in it."""
 
     def __init__(self, scene: SeparableScene, light: Illumination, substeps: int, optics: ArmOptics) -> None:
         self._size, self._source, self._substeps = scene.size, light, substeps
-        video = seen(scene.masks, optics)
-        pixels: NDArray[np.float32] = video[:, :, ::substeps].copy()
+        masks = arm_view(scene.masks, optics)
+        pixels: NDArray[np.float32] = masks[:, :, ::substeps].copy()
         for column in range(1, substeps):
-            pixels += video[:, :, column::substeps]
-        # A mask covers few rows: the others add nothing to the product.
+            pixels += masks[:, :, column::substeps]
+        # A mask covers few rows, and the others would add nothing to the product.
         self._rows = [_covered_rows(mask) for mask in pixels]
         self._weights = np.concatenate([mask[rows] for mask, rows in zip(pixels, self._rows, strict=True)])
         self._windows = np.empty((TILE_LINES, len(self._weights)), np.float32)
@@ -140,7 +137,8 @@ class SeparableLines:
             start = 0
             for h, rows in zip(light, self._rows, strict=True):
                 width = rows.stop - rows.start
-                # Line i meets row r at sub-step S·i + r: lines are windows of h, S apart, times the mask.
+                # Line i meets row r at sub-step S·i + r: lines are the product of windows of h, S apart, with
+                # the mask.
                 windows = sliding_window_view(h[rows.start :], width)[:: self._substeps]
                 self._windows[:, start : start + width] = windows[:TILE_LINES]
                 start += width
@@ -148,7 +146,7 @@ class SeparableLines:
             self._tile_index = index
 
     def _light(self, first: int) -> NDArray[np.float32]:
-        """h_k(first + i) for every sub-step i at which a line of a tile meets a row: (K, i)."""
+        """Return h_k(first + i) for every sub-step i at which a line of a tile meets a row: (K, i)."""
         S = self._substeps
         count = S * (TILE_LINES - 1) + self._size
         lit = self._source.light(first, count + S - 1)
@@ -157,26 +155,27 @@ class SeparableLines:
 
 
 class FrameLines:
-    """Lines of any scene; what unfinished packets have gathered is kept for the call that continues.
+    """Lines of any scene; the charge of unfinished packets is kept for the next call.
 
-    ``width``: of the frames; a scene that a fibre has laid out is wider than it has rows.
+    ``width`` is that of the frames: a scene laid out by a fibre is wider than it is high.
     """
 
     def __init__(
         self, scene: Scene, light: Illumination, substeps: int, optics: ArmOptics, width: int
     ) -> None:
-        from acquire.sim import kernels  # a compiler, which separable scenes do without
+        from acquire.sim import kernels  # needs a compiler, which separable scenes do without
 
         self._kernels = kernels
         self._scene, self._source, self._substeps = scene, light, substeps
         n, self._width = scene.size, width
         self._block = max(1, _BLOCK_BYTES // (4 * n * width))
         self._along_rows = optics.turn_deg % 180 == 0
+        # scene pixel → its row and column on the sensor
         place = np.empty(n * width, np.int64)
-        place[seen(np.arange(n * width).reshape(1, n, width), optics).ravel()] = np.arange(n * width)
+        place[arm_view(np.arange(n * width).reshape(1, n, width), optics).ravel()] = np.arange(n * width)
         row, column = (place // width).reshape(n, width), (place % width).reshape(n, width)
-        # Of a row of the scene, or of a column where charge moves along those: its row on the sensor, and
-        # of the other axis its column there.
+        # The sensor's row for each row of the scene, or for each column if charge moves along the columns;
+        # and the sensor's column for each index of the other axis.
         self._rows = row[:, 0] if self._along_rows else row[0]
         self._columns = column[0] if self._along_rows else column[:, 0]
         self._unfinished = np.zeros((n, width))
@@ -191,7 +190,8 @@ class FrameLines:
 
     def _some_lines(self, first_line: int, count: int) -> NDArray[np.float32]:
         S, n = self._substeps, self._scene.size
-        # Always (along the moving charge, across it) or the reverse, as the kernel walks through the frames.
+        # ``packets`` is laid out as the kernel traverses the frames; ``gathered`` is a view of it that is
+        # always (along the moving charge, across it).
         packets = np.zeros((S * count + n, self._width) if self._along_rows else (n, S * count + n))
         gathered = packets if self._along_rows else packets.T
         begin, end = S * first_line, S * (first_line + count) + n - 1
@@ -224,13 +224,13 @@ class FrameLines:
             self._kernels.add_along_columns(frames, light[lit], newest - (self._scene.size - 1), packets)
 
 
-def seen(video: NDArray[Any], optics: ArmOptics) -> NDArray[Any]:
-    """Frames (…, row, column) as an arm sees them: mirrored, then turned counter-clockwise."""
+def arm_view(video: NDArray[Any], optics: ArmOptics) -> NDArray[Any]:
+    """Return frames (…, row, column) as an arm sees them: mirrored, then rotated counter-clockwise."""
     mirrored = video[:, :, ::-1] if optics.mirror else video
     return np.rot90(mirrored, optics.turn_deg // 90, axes=(1, 2))
 
 
 def _covered_rows(mask: NDArray[np.float32]) -> slice:
-    """The rows of (row, pixel) from the first to the last that is not all 0; one row of an empty mask."""
+    """Return the rows of (row, pixel) from the first to the last that is not all 0; one row if all are."""
     covered = np.flatnonzero(mask.any(axis=1))
     return slice(int(covered[0]), int(covered[-1]) + 1) if len(covered) else slice(0, 1)

@@ -1,12 +1,12 @@
-"""Files of the user as scenes: pictures, videos and arrays of any size and frame rate.
+"""The user's files as scenes: pictures, videos and arrays of any size and frame rate.
 
-One frame is decoded at a time and only a few are kept, at the scene's size: an hour of video fits::
+Frames are decoded one at a time and only a few are kept, at the scene's size, so that an hour of video fits::
 
-    file ─▶ frame i, as light (h, w) ─▶ square (fit) ─▶ (n, n), mean over what each pixel covers ─▶ cache
+    file ─▶ frame i, as light (h, w) ─▶ square (fit) ─▶ (n, n), mean over each pixel's area ─▶ cache
     sub-step t ─▶ position t·frame_rate ─▶ the frame before (hold), or that and the next one (blend)
 
-Pillow reads pictures and animations (PNG, TIFF, GIF, WebP …), numpy reads ``.npy``, and PyAV, where it is
-installed, every container that FFmpeg knows.
+Pillow reads pictures and animations (PNG, TIFF, GIF, WebP …), numpy reads ``.npy``, and PyAV, if it is
+installed, reads every container that FFmpeg supports.
 """
 
 from __future__ import annotations
@@ -33,35 +33,39 @@ if TYPE_CHECKING:
 
 _KEPT_FRAMES = 16
 _CHECKED_VALUES = 1 << 22
-"""Elements of an array that are looked at at a time."""
+"""Elements of an array that are checked at a time."""
 MAX_PIXELS = 1 << 26
-"""Of one frame, before it is made small."""
+"""Largest size of one frame, before it is resampled."""
 
 
 class Source(Protocol):
-    """Frames of a file, in order or by their number; grey values 0 to 1."""
+    """Frames of a file, in order or by number; grey values 0 to 1."""
 
     @property
     def frame_rate_hz(self) -> float | None: ...
 
     @property
     def count(self) -> int:
-        """Frames of the file."""
+        """Number of frames in the file."""
         ...
 
     def frame(self, index: int) -> Light:
-        """(row, column) float32."""
+        """Return one frame: (row, column) float32."""
         ...
 
 
 class VideoSceneConfig(SceneModel):
-    """A file of the user: a picture, a video, or an array (time, row, column) of 0 to 1 as .npy."""
+    """A user's file: a picture, a video, or an array (time, row, column) of 0 to 1 as .npy."""
 
     kind: Literal["video"]
     path: FilePath = Field(description="relative to the scene file")
     frame_rate_hz: float | None = Field(default=None, gt=0, description="absent: the file's own")
-    fit: Literal["fill", "pad", "stretch"] = Field(default="fill", description="how it becomes square")
-    between: Literal["hold", "blend"] = Field(default="blend", description="light between two frames")
+    fit: Literal["fill", "pad", "stretch"] = Field(
+        default="fill", description="how a picture is made square: cropped, padded with black or stretched"
+    )
+    between: Literal["hold", "blend"] = Field(
+        default="blend", description="light between two frames: the earlier one, or a mixture of both"
+    )
     end: Literal["loop", "last"] = "loop"
     gamma: float = Field(default=1.0, gt=0, le=5, description="light = (pixel / white)^gamma")
 
@@ -73,7 +77,7 @@ class VideoSceneConfig(SceneModel):
 
 
 class VideoScene:
-    """A file shown to the cameras; see the module. UsageError for files that are none."""
+    """A file shown to the cameras; see the module. Raises UsageError for files that cannot be read."""
 
     def __init__(self, config: VideoSceneConfig, size: int, substep_s: float) -> None:
         self.size = size
@@ -82,7 +86,7 @@ class VideoScene:
         rate_hz = config.frame_rate_hz or self._source.frame_rate_hz
         if rate_hz is None and self._source.count > 1:
             raise UsageError(
-                f"{config.path} does not say its frame rate", hint="frame_rate_hz in the scene file"
+                f"{config.path} does not state its frame rate", hint="set frame_rate_hz in the scene file"
             )
         self._frames_per_substep = (rate_hz or 0.0) * substep_s
         self._kept: OrderedDict[int, Light] = OrderedDict()
@@ -99,12 +103,13 @@ class VideoScene:
         part = (position - before).astype(np.float32)
         out = np.empty((len(substeps), self.size, self.size), np.float32)
         for i, (index, after) in enumerate(zip(before.tolist(), part.tolist(), strict=True)):
-            out[i] = self._shown(index)
+            out[i] = self._resampled(index)
             if after and self._config.between == "blend":
-                out[i] += after * (self._shown(index + 1) - out[i])
+                out[i] += after * (self._resampled(index + 1) - out[i])
         return out
 
-    def _shown(self, index: int) -> Light:
+    def _resampled(self, index: int) -> Light:
+        """Return the file's frame for an index of any size, at the scene's size; recent ones are cached."""
         last = self._source.count - 1
         index = index % (last + 1) if self._config.end == "loop" else min(max(index, 0), last)
         if index in self._kept:
@@ -118,9 +123,9 @@ class VideoScene:
 
 
 def open_media(path: Path) -> Source:
-    """The frames of a file of any kind that one of the libraries reads."""
+    """Return the frames of a file, read by the first library that can."""
     if not path.is_file():
-        raise UsageError(f"scene file {path}: there is no such file")
+        raise UsageError(f"scene file {path} does not exist")
     if path.suffix == ".npy":
         return _ArrayFile(path)
     from PIL import Image
@@ -134,7 +139,7 @@ def open_media(path: Path) -> Source:
 
 
 def read_picture(path: Path, side: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Light (multiplied by its alpha) and alpha of the first frame of a file, (side, side) each."""
+    """Return light (premultiplied by alpha) and alpha of a file's first frame, (side, side) each."""
     from PIL import Image
 
     try:
@@ -148,14 +153,17 @@ def read_picture(path: Path, side: int) -> tuple[NDArray[np.float64], NDArray[np
 
 
 def resample(picture: Light, size: int) -> Light:
-    """(h, w) → (size, size): means over what each pixel covers; a smaller picture's pixels become squares."""
+    """Return a picture (h, w) as (size, size): each pixel is the mean over its area of the picture.
+
+    The pixels of a picture smaller than ``size`` become squares.
+    """
     rows, columns = (_weights(length, size) for length in picture.shape)
     resampled: Light = rows @ picture @ columns.T
     return resampled
 
 
 def _weights(length: int, size: int) -> Light:
-    """(size, length): what part of new pixel i is covered by old pixel j."""
+    """Return the fraction of new pixel i that old pixel j covers: (size, length)."""
     new = np.arange(size + 1) * (length / size)
     low = np.maximum(new[:-1, None], np.arange(length))
     high = np.minimum(new[1:, None], np.arange(1, length + 1))
@@ -165,6 +173,7 @@ def _weights(length: int, size: int) -> Light:
 
 
 def _square(picture: Light, fit: str) -> Light:
+    """Return the picture cropped ("fill") or padded ("pad") to a square, or as it is for "stretch"."""
     height, width = picture.shape
     if fit == "stretch" or height == width:
         return picture
@@ -180,7 +189,7 @@ def _square(picture: Light, fit: str) -> Light:
 
 
 class _ArrayFile:
-    """``.npy``: (time, row, column) or (row, column); integers are parts of their largest value."""
+    """``.npy``: (time, row, column) or (row, column); integers are scaled by their type's largest value."""
 
     frame_rate_hz = None
 
@@ -188,7 +197,7 @@ class _ArrayFile:
         try:
             video = np.load(path, mmap_mode="r", allow_pickle=False)
         except (OSError, ValueError, EOFError) as error:
-            raise UsageError(f"{path} is no array: {error}") from error
+            raise UsageError(f"{path} is not an array: {error}") from error
         self._video: NDArray[Any] = video[None] if video.ndim == 2 else video
         if self._video.ndim != 3 or 0 in self._video.shape:
             raise UsageError(
@@ -198,9 +207,9 @@ class _ArrayFile:
             raise UsageError(f"{path} is an array of {self._video.dtype}", possible="numbers")
         self._white = float(np.iinfo(video.dtype).max) if video.dtype.kind in "ui" else 1.0
         step = max(1, _CHECKED_VALUES // self._video[0].size)
-        for at in range(0, len(self._video), step):
-            part = self._video[at : at + step]
-            checked_light(part, part.shape, f"{path}, frames {at} to {at + len(part) - 1},")
+        for first in range(0, len(self._video), step):
+            part = self._video[first : first + step]
+            checked_light(part, part.shape, f"{path}, frames {first} to {first + len(part) - 1},")
 
     @property
     def count(self) -> int:
@@ -212,7 +221,7 @@ class _ArrayFile:
 
 
 class _PictureFile:
-    """What Pillow reads; every frame must decode, which is tried at once."""
+    """A file that Pillow reads. Its last frame is decoded at once, to refuse damaged files early."""
 
     def __init__(self, path: Path) -> None:
         from PIL import Image
@@ -227,29 +236,24 @@ class _PictureFile:
         self.frame_rate_hz = 1000 / duration_ms if duration_ms > 0 else None
 
     def frame(self, index: int) -> Light:
+        from PIL import Image
+
         try:
-            return self._read(index)
+            with Image.open(self._path) as image:
+                image.seek(index)
+                if image.mode.startswith(("I", "F")):  # 16-bit or float
+                    white = 1.0 if image.mode == "F" else 65535.0
+                    light = np.asarray(image, np.float32) / white
+                    return checked_light(light, light.shape, str(self._path))
+                return _grey(image.convert("L"))
         except (OSError, SyntaxError, ValueError, EOFError) as error:
             raise DataError(f"{self._path}: frame {index} cannot be read: {error}") from error
 
-    def _read(self, index: int) -> Light:
-        from PIL import Image
-
-        with Image.open(self._path) as image:
-            image.seek(index)
-            if image.mode.startswith(("I", "F")):
-                light = np.asarray(image, np.float32) / _white(image.mode)
-                return checked_light(light, light.shape, str(self._path))
-            return _grey(image.convert("L"))
-
 
 def _grey(levels: Any) -> Light:
+    """Return 8-bit grey levels as light, 0 to 1."""
     grey: Light = np.asarray(levels, np.float32) / np.float32(255)
     return grey
-
-
-def _white(mode: str) -> float:
-    return 1.0 if mode == "F" else 65535.0
 
 
 def _check_size(path: Path, width: int, height: int) -> None:
@@ -264,7 +268,8 @@ def _open_container(path: Path) -> Source:
         import av
     except ImportError as error:
         raise UsageError(
-            f"{path} is not a picture that Pillow reads", hint="pip install 'tdi-acquire[video]' for videos"
+            f"{path} is not a picture that Pillow can read",
+            hint="pip install 'tdi-acquire[video]' for videos",
         ) from error
     try:
         return _Container(path)
@@ -276,7 +281,7 @@ def _open_container(path: Path) -> Source:
 
 
 class _Container:
-    """What FFmpeg reads, decoded forwards; asked for an earlier frame, it begins again."""
+    """A file that FFmpeg reads, decoded forwards; a request for an earlier frame starts over."""
 
     def __init__(self, path: Path) -> None:
         import av
@@ -288,34 +293,32 @@ class _Container:
             stream = container.streams.video[0]
             _check_size(path, stream.width, stream.height)
             rate = stream.average_rate or stream.guessed_rate
-            # Containers are not always right about the number of their frames; packets are.
+            # The frame count in a container's header is not always right; the number of packets is.
             self.count = sum(1 for packet in container.demux(stream) if packet.size)
         if not self.count:
-            raise UsageError(f"{path} holds no frame")
+            raise UsageError(f"{path} holds no frames")
         self.frame_rate_hz = float(Fraction(rate)) if rate else None
         self._next = 0
         self._decoded: Iterator[Light] = self._decode()
         self._latest: Light | None = None
 
     def frame(self, index: int) -> Light:
+        import av
+
         if index < self._next - 1 or self._latest is None:
             self._next, self._decoded = 0, self._decode()
         while self._next <= index:
-            latest = self._decode_next()
+            try:
+                latest = next(self._decoded, None)
+            except av.FFmpegError as error:
+                raise DataError(f"{self._path}: frame {self._next} cannot be decoded: {error}") from error
             if latest is None and self._latest is None:
                 raise UsageError(f"{self._path}: no frame can be decoded")
+            # A packet need not yield a frame: the last one is then held for the missing frames at the end.
             self._latest = self._latest if latest is None else latest
             self._next += 1
         assert self._latest is not None
         return self._latest
-
-    def _decode_next(self) -> Light | None:
-        import av
-
-        try:
-            return next(self._decoded, None)
-        except av.FFmpegError as error:
-            raise DataError(f"{self._path}: frame {self._next} cannot be decoded: {error}") from error
 
     def _decode(self) -> Iterator[Light]:
         import av

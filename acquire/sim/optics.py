@@ -1,4 +1,4 @@
-"""Scenes as optics, fibres and coarser sensors show them; separable scenes stay separable."""
+"""Scenes as seen through optics, fibres and coarser sensors; separable scenes stay separable."""
 
 from __future__ import annotations
 
@@ -19,17 +19,17 @@ if TYPE_CHECKING:
 
 
 def mapped(scene: Scene, image: Image) -> Scene:
-    """The scene through a linear map of its frames (k, n, n)."""
+    """Return the scene with a linear map applied to its frames (k, n, n)."""
     return _MappedMasks(scene, image) if isinstance(scene, SeparableScene) else _MappedFrames(scene, image)
 
 
 def binned(scene: Scene, factor: int) -> Scene:
-    """What steps and pixels gather that are ``factor`` times longer and wider: sums of light."""
+    """Return the sums of light over sub-steps and pixels that are ``factor`` times longer and wider."""
     return _BinnedMasks(scene, factor) if isinstance(scene, SeparableScene) else _BinnedFrames(scene, factor)
 
 
 def laid_out(scene: Scene, fibre: Fibre, arm: str) -> Scene:
-    """The middle of a square scene as a fibre lays it out on an arm's sensor: n rows, as wide as that."""
+    """Return the middle of a square scene as a fibre lays it out over the width of an arm's sensor."""
     rows, columns = fibre.field()
 
     def image(frames: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -40,8 +40,8 @@ def laid_out(scene: Scene, fibre: Fibre, arm: str) -> Scene:
     return _MappedFrames(scene, image, fibre.size)
 
 
-def seen_in(scene: Scene, fibre: Fibre, tile: Tile) -> Scene:
-    """What a tile behind a fibre shows of the square scene that the field lies in."""
+def tile_view(scene: Scene, fibre: Fibre, tile: Tile) -> Scene:
+    """Return the part of the square scene that a tile behind a fibre shows."""
     row, column = (
         side.start + fibre.size * place
         for side, place in zip(fibre.field(), (tile.row, tile.column), strict=True)
@@ -63,7 +63,7 @@ class _MappedMasks(MaskScene):
 
 class _MappedFrames:
     def __init__(self, scene: Scene, image: Image, size: int | None = None) -> None:
-        """``size``: rows of the image, where the map changes them."""
+        """``size`` is the number of rows of the image, if the map changes it."""
         self.size = scene.size if size is None else size
         self._scene, self._image = scene, image
 
@@ -75,7 +75,7 @@ class _MappedFrames:
 
 
 class _BinnedMasks(MaskScene):
-    """Intensities are means over the sensor's steps; the masks make sums of them."""
+    """Intensities are means over the sensor's sub-steps; the factor in the masks turns them into sums."""
 
     def __init__(self, scene: SeparableScene, factor: int) -> None:
         self._scene, self._factor = scene, factor

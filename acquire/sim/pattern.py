@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class PatternLight:
-    """What a simulated camera reads out, where `acquire.sim.pipeline.Camera` stands otherwise."""
+    """A sensor that reads out stored lines, in place of `acquire.sim.pipeline.Camera`."""
 
     pattern: Pattern
 
@@ -46,9 +46,9 @@ class PatternOptics:
 
 @dataclass(frozen=True, slots=True)
 class PatternCameraOpener:
-    """Opens a camera that shows its pattern at the pulses of ``wire``. Picklable.
+    """Opens a camera that reads out its pattern at the pulses of ``wire``. Picklable.
 
-    ``pixels`` per line; those of the geometry, unless a load asks for more.
+    ``pixels`` per line are those of the geometry, unless a load test needs more.
     """
 
     wire: Wire | PinWire
@@ -62,6 +62,6 @@ class PatternCameraOpener:
     def __call__(self) -> SimulatedCamera:
         config = self.config
         pattern = Pattern(self.arm, self.pixels or self.geometry.stages, config.dtype, config.white_dn)
-        pattern.lines(0, 1)  # the table is made now, not when the first lines are due
+        pattern.lines(0, 1)  # builds the table now, rather than when the first lines are due
         optics = PatternOptics(self.geometry, pattern)
         return SimulatedCamera(self.wire, optics, config, self.block_lines, self.line_rate_hz)

@@ -1,13 +1,13 @@
-"""The pins of a trigger that runs as a program of its own, as simulated cameras see them.
+"""The pins of a trigger that runs in its own process, as simulated cameras see them.
 
-Where the wire of `acquire.sim.clock` says when pulses are due, this page says which ones have come, and
-what the light was in every sub-step that is over::
+The wire of `acquire.sim.clock` states when pulses are due. This page records which pulses have come, and the
+light in every sub-step that has ended::
 
     gateware's process                      memfd                              camera processes
-    publish  ──▶ [ sequence | run | pulses a, b | sub-steps | light ... ] ◀── look, wait, light
+    publish  ──▶ [ sequence | run | pulses a, b | sub-steps | light ... ] ◀── read, wait, light
 
-Reading is optimistic, as with the wire: the sequence is odd while the writer writes, and a reading counts
-only if it was the same even number before and after. Light is kept for ROOM sub-steps, a byte each.
+Reading is optimistic, as with the wire: the sequence is odd while the writer writes, and a reading is valid
+only if it was the same even number before and after. Light is kept for ROOM sub-steps, one byte each.
 """
 
 from __future__ import annotations
@@ -33,18 +33,21 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 ROOM = 1 << 23
-"""Sub-steps whose light is kept: a minute and more."""
+"""Number of sub-steps whose light is kept: more than a minute."""
 _HEADER_BYTES = 4096
 _SEQUENCE, _RUN, _RUNNING, _PULSES, _SUBSTEPS, _PERIOD_CLOCKS, _CLOCK_HZ, _FIELDS = 0, 1, 2, 3, 5, 6, 7, 8
 _POLL_S = 0.001
 _TORN_S = 1.0
 _LIGHT_S = 10.0
-"""A camera waits for light at most so long; it needs it some hundred lines ahead."""
+"""Longest wait of a camera for light, which it needs some hundred lines ahead."""
 
 
 @dataclass(frozen=True, slots=True)
 class PinRun:
-    """What the pins have shown of one run: ``number`` from 1; 0 line clocks: not known yet."""
+    """What the pins have shown of one run.
+
+    ``number`` counts from 1; ``line_clocks`` is the line period in clock cycles, 0 until it is known.
+    """
 
     number: int
     running: bool
@@ -54,10 +57,10 @@ class PinRun:
 
 
 class PinPage:
-    """The page. One process publishes, any number look; it can be given to a child being spawned."""
+    """The page. One process publishes, any number read; it can be passed to a child being spawned."""
 
     def __init__(self, descriptor: int | None = None) -> None:
-        """A new page, or the one behind an inherited descriptor, which is taken over."""
+        """Create a page, or map the one behind an inherited descriptor and take over that descriptor."""
         if descriptor is None:
             descriptor = os.memfd_create("acquire-pins", os.MFD_CLOEXEC)
             os.ftruncate(descriptor, _HEADER_BYTES + ROOM)
@@ -68,7 +71,10 @@ class PinPage:
         self._close_descriptor = weakref.finalize(self, os.close, descriptor)
 
     def close(self) -> None:
-        """Idempotent; nobody may look any more. A forgotten page closes itself."""
+        """Unmap the page, which must not be read afterwards. Idempotent.
+
+        A page that is garbage-collected closes itself.
+        """
         self._header, self._light = np.empty(0, np.uint64), np.empty(0, np.uint8)
         self._page.close()
         self._close_descriptor()
@@ -78,7 +84,7 @@ class PinPage:
         return _receive, (DupFd(self.descriptor),)
 
     def publish(self, run: PinRun, light: bytes, clock_hz: int) -> None:
-        """What has come of a run up to now; ``light`` has a byte per sub-step that has ended since."""
+        """Publish the state of a run; ``light`` has one byte per sub-step that ended since the last call."""
         header = self._header
         header[_SEQUENCE] += np.uint64(1)
         done = 0 if run.number != header[_RUN] else int(header[_SUBSTEPS])
@@ -95,7 +101,7 @@ class PinPage:
         header[_SEQUENCE] += np.uint64(1)
 
     def read(self) -> NDArray[np.uint64]:
-        """The header's fields, all of one moment."""
+        """Return the header's fields, all from one moment."""
         deadline_s = time.monotonic() + _TORN_S
         while time.monotonic() < deadline_s:
             before = int(self._header[_SEQUENCE])
@@ -103,7 +109,7 @@ class PinPage:
             if not before & 1 and before == int(self._header[_SEQUENCE]):
                 return fields
             time.sleep(0)
-        raise DeviceError("the gateware's process died while it wrote down its pins")
+        raise DeviceError("the gateware's process died while it was publishing its pins")
 
     @property
     def latest_run(self) -> int:
@@ -111,23 +117,24 @@ class PinPage:
         return int(self.read()[_RUN])
 
     def light(self, run: int, start: int, length: int) -> NDArray[np.uint8]:
-        """Light (0 or 1) of sub-steps ``start`` on, once they are over; dark outside of the run.
+        """Return the light (0 or 1) of ``length`` sub-steps once they have ended; dark outside the run.
 
-        Raises DeviceError when it does not come, or is forgotten.
+        Raises DeviceError if the light does not come in time, or is no longer kept.
         """
         fields = self._await_light(run, start + length)
         index = np.arange(start, start + length)
         lit = self._light[index % ROOM] * ((index >= 0) & (index < int(fields[_SUBSTEPS])))
         if int(self.read()[_SUBSTEPS]) - max(start, 0) > ROOM:
-            raise DeviceError(f"a camera asked for the light of sub-step {start} too late")
+            raise DeviceError(f"a camera asked too late for the light of sub-step {start}")
         return lit.astype(np.uint8)
 
     def _await_light(self, run: int, end: int) -> NDArray[np.uint64]:
+        """Wait until sub-step ``end`` of the run has begun or the run has ended; return the header."""
         deadline_s = time.monotonic() + _LIGHT_S
         while time.monotonic() < deadline_s:
             fields = self.read()
             if fields[_RUN] != run:
-                raise DeviceError(f"run {run} of the trigger is over and its light forgotten")
+                raise DeviceError(f"run {run} of the trigger is over, and its light is no longer kept")
             if fields[_SUBSTEPS] >= end or not fields[_RUNNING]:
                 return fields
             time.sleep(_POLL_S)
@@ -136,14 +143,14 @@ class PinPage:
 
 @dataclass(frozen=True, slots=True)
 class PinWire:
-    """One camera's end of the page, in place of a `Wire`: its own trigger's pulses."""
+    """One camera's end of the page, in place of a `Wire`: it reports the pulses of its own arm."""
 
     page: PinPage
     arm: str
     clock: HostClock = field(default_factory=HostClock)
 
     def read(self) -> Reading:
-        """The run that the pins show, as a pulse train, and this arm's pulses so far."""
+        """Return the run that the pins show, as a pulse train, and this arm's pulses so far."""
         fields = [int(value) for value in self.page.read()]
         issued = fields[_PULSES + ARMS.index(self.arm)]
         if fields[_RUN] == 0:
@@ -164,23 +171,23 @@ class PinWire:
         )
 
     def wait(self, run: int, pulses: int, timeout_s: float) -> Reading:
-        """As `Wire.wait`."""
+        """Wait as `Wire.wait` does."""
         deadline_s = time.monotonic() + timeout_s
         while True:
             reading = self.read()
-            come = reading.run == run and (reading.stopped or reading.issued >= pulses)
-            if come or reading.run > run or time.monotonic() >= deadline_s:
+            done = reading.run == run and (reading.stopped or reading.issued >= pulses)
+            if done or reading.run > run or time.monotonic() >= deadline_s:
                 return reading
             time.sleep(_POLL_S)
 
     def code(self, train: PulseTrain) -> PinCode:
-        """What the light of a train did."""
+        """Return the light that was emitted during a train."""
         return PinCode(self.page, train.run)
 
 
 @dataclass(frozen=True, slots=True)
 class PinCode:
-    """The light that was really emitted, as a run's code."""
+    """The light that was actually emitted, as the code of a run."""
 
     page: PinPage
     run: int

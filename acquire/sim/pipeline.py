@@ -1,4 +1,4 @@
-"""From a scene file to the lines of a camera: the bare forward model, and only the stages that are listed.
+"""From a scene file to the lines of a camera: the bare forward model plus only the listed stages.
 
 ::
 
@@ -6,11 +6,11 @@
                                ├─▶ Eq. (1) ─▶ [signal] ─▶ K⁻¹ ─▶ [charge] ─▶ K ─▶ [readout] ─▶ DN ─▶ [stream]
     scene ─▶ [image] ────────▶ ┘
 
-In brackets what `acquire.sim.effects` gives. With nothing listed `Sensor.read` is Eq. (1), a factor, an
-offset and a rounding. The layouts differ in what stands around it: ``compact`` has two images side by side on
-one sensor, ``emulated`` a sensor of M·S stages whose raw lines are merged S × S, ``interline`` a coarse
-sensor under the fine scene. Behind a fibre (`acquire.fibre`) the scene is drawn as a square that its field
-fits in, effects act on that image, and the field is then laid out on the sensor.
+The stages in brackets come from `acquire.sim.effects`. With none listed, `Sensor.read` is Eq. (1), a factor,
+an offset and a rounding. The layouts differ in the sensor: ``compact`` has two images side by side on one
+sensor, ``emulated`` a sensor of M·S stages whose raw lines are merged S × S, ``interline`` a coarse sensor
+under the fine scene. Behind a fibre (`acquire.fibre`) the scene is drawn as a square that contains the
+fibre's field; effects act on that image, and the field is then laid out on the sensor.
 """
 
 from __future__ import annotations
@@ -60,18 +60,18 @@ class Converter:
         return cls(camera.white_dn, camera.black_level_dn, camera.responsivity_dn, camera.dtype)
 
     def convert(self, light: NDArray[Any]) -> NDArray[Any]:
-        """Y of Eq. (1) to DN."""
+        """Convert Y of Eq. (1) to DN."""
         return self.round(light * np.float32(self.responsivity_dn) + np.float32(self.black_level_dn))
 
     def round(self, dn: NDArray[Any]) -> NDArray[Any]:
-        """DN to whole numbers of the range."""
+        """Round DN to integers and clip them to the range."""
         pixels: NDArray[Any] = np.clip(np.rint(dn), 0, self.white_dn).astype(self.dtype)
         return pixels
 
 
 @dataclass(frozen=True, slots=True)
 class Bench:
-    """Everything that a simulated camera depends on. Picklable; the scene's file decides most of it."""
+    """Everything that a simulated camera depends on, most of it from the scene file. Picklable."""
 
     scene: SceneConfig
     geometry: GeometryConfig
@@ -80,24 +80,24 @@ class Bench:
     realisation: int = 0
     stopwatch: Stopwatch | None = None
     settled_s: Mapping[str, float] = field(default_factory=dict)
-    """Arm → by how much the trigger starts the charge's moves after the light's (s); absent: not at all."""
+    """Arm → time (s) by which the trigger starts the charge transfers after the light; absent: 0."""
     lit_part: tuple[float, float] = (0.0, 1.0)
-    """From where to where of a lit sub-step the trigger lets the light on."""
+    """Begin and end of the light within a lit sub-step, as fractions of it, as the trigger sets them."""
     fibre: Fibre | None = None
 
     def without(self, *effects: str) -> Bench:
-        """The same bench, some effects not listed."""
+        """Return the same bench without some of its effects."""
         kept = tuple(effect for effect in self.scene.effects if effect.kind not in effects)
         return replace(self, scene=self.scene.model_copy(update={"effects": kept}))
 
     def camera(self, arm: str, code: Code) -> Camera:
-        """The lines that the camera of ``arm`` gives under a code. UsageError for what cannot be."""
+        """Return the camera of ``arm`` under a code. Raises UsageError for an impossible combination."""
         optics = self.scene.optics
         converter = Converter.of(self.cameras[arm])
         if self.fibre is not None:
             if optics != OpticsConfig():
                 raise UsageError(
-                    "the scene has optics of its own, which the rig's fibre leaves no room for",
+                    "the scene has [optics] of its own, which cannot be combined with the rig's fibre",
                     possible="a scene without [optics]; or a rig without [fibre]",
                 )
             return _sensor(
@@ -114,7 +114,7 @@ class Bench:
                 )
 
     def fine_scene(self) -> Scene:
-        """What the cameras look at, as fine as they can tell: in camera A's rows and columns."""
+        """Return the scene at the finest resolution that the cameras use, in camera A's rows and columns."""
         size = self.geometry.stages * self.geometry.substeps if self.fibre is None else self.fibre.side
         if self.scene.optics.layout != "interline":
             return build_scene(self.scene, size, self.substep_s)
@@ -128,13 +128,13 @@ class Bench:
 
 
 class Camera(ABC):
-    """Something whose lines can be read; see `Bench.camera`."""
+    """The source of one arm's lines; see `Bench.camera`."""
 
     stages: tuple[Stage, ...]
 
     @abstractmethod
     def read(self, first_line: int, count: int) -> Readout:
-        """``count`` lines from ``first_line`` on."""
+        """Return ``count`` lines from ``first_line`` on."""
 
 
 class Sensor(Camera):
@@ -154,43 +154,43 @@ class Sensor(Camera):
         self._tiles: dict[int, Readout] = {}
 
     def read(self, first_line: int, count: int) -> Readout:
-        """Lines ``first_line .. first_line + count - 1``; numbers below 0 are preroll."""
+        """Return lines ``first_line .. first_line + count - 1``; numbers below 0 are preroll."""
         if self._pointwise:
             pixels = self._converter.convert(self._expected(first_line, count))
             return Readout(pixels, np.zeros(count, np.bool_))
         tiles = range(first_line // TILE_LINES, (first_line + count - 1) // TILE_LINES + 1)
         parts = [self._tile(index) for index in tiles]
-        at = slice(first_line % TILE_LINES, first_line % TILE_LINES + count)
-        pixels = np.concatenate([part.pixels for part in parts])[at]
-        return Readout(pixels, np.concatenate([part.missing for part in parts])[at])
+        inside = slice(first_line % TILE_LINES, first_line % TILE_LINES + count)
+        pixels = np.concatenate([part.pixels for part in parts])[inside]
+        return Readout(pixels, np.concatenate([part.missing for part in parts])[inside])
 
     def _expected(self, first_line: int, count: int) -> NDArray[Any]:
-        """Y of every pixel of the sensor, with the effects on the signal."""
+        """Return Y of every pixel of the sensor, including the effects on the signal."""
         if len(self._images) == 1 and self._images[0].column == 0:
             return self._images[0].lines(first_line, count)
         lines = np.zeros((count, self._pixels), np.float32)
         for image in self._images:
-            seen = image.lines(first_line, count)
-            lines[:, image.column : image.column + seen.shape[1]] = seen
+            part = image.lines(first_line, count)
+            lines[:, image.column : image.column + part.shape[1]] = part
         return lines
 
     def _tile(self, index: int) -> Readout:
+        """Return a tile of lines as delivered, after the effects on the stream.
+
+        Tiles lie at fixed positions, so that the draws of an effect do not depend on the split into calls.
+        """
         if index not in self._tiles:
-            tile = self._delivered(index)
-            # The last two: a block of lines may begin in one and end in the next.
+            pixels, missing = self._digital(index), np.zeros(TILE_LINES, np.bool_)
+            for stage in self._by_place["stream"]:
+                pixels, lost = stage.run(pixels, index * TILE_LINES, lambda: self._digital(index - 1)[-1:])
+                missing = missing if lost is None else missing | lost
+            tile = Readout(np.where(missing[:, None], 0, pixels).astype(pixels.dtype), missing)
+            # The last two are kept: a block of lines may begin in one tile and end in the next.
             self._tiles = {key: self._tiles[key] for key in list(self._tiles)[-1:]} | {index: tile}
         return self._tiles[index]
 
-    def _delivered(self, index: int) -> Readout:
-        # Whole tiles at fixed places: what an effect draws must not depend on how lines are asked for.
-        first_line = index * TILE_LINES
-        pixels, missing = self._digital(index), np.zeros(TILE_LINES, np.bool_)
-        for stage in self._by_place["stream"]:
-            pixels, lost = stage.run(pixels, first_line, lambda: self._digital(index - 1)[-1:])
-            missing = missing if lost is None else missing | lost
-        return Readout(np.where(missing[:, None], 0, pixels).astype(pixels.dtype), missing)
-
     def _digital(self, index: int) -> NDArray[Any]:
+        """Return a tile of lines as converted, before the effects on the stream."""
         first_line, light = index * TILE_LINES, self._expected(index * TILE_LINES, TILE_LINES)
         electrons = light.astype(np.float64) * (self._converter.responsivity_dn / self._gain)
         for stage in self._by_place["charge"]:
@@ -202,9 +202,9 @@ class Sensor(Camera):
 
 
 class Merged(Camera):
-    """Raw lines of a sensor with whole steps, merged S × S in the digital domain (Sect. 5.1).
+    """Raw lines of a sensor without sub-steps, merged S × S in the digital domain (Sect. 5.1).
 
-    A merged sample is white when one of its raw samples is.
+    A merged sample is white if any of its raw samples is.
     """
 
     def __init__(self, raw: Sensor, raw_white_dn: int, substeps: int, converter: Converter) -> None:
@@ -217,7 +217,7 @@ class Merged(Camera):
         )
 
     def read(self, first_line: int, count: int) -> Readout:
-        """Line ℓ of Eq. (1) is the raw lines S·ℓ … S·ℓ + S − 1, S columns each."""
+        """Return lines; line ℓ of Eq. (1) is the sum of raw lines S·ℓ … S·ℓ + S − 1 over S columns each."""
         S = self._substeps
         raw = self._raw.read(S * first_line, S * count)
         blocks = raw.pixels.reshape(count, S, -1, S)
@@ -236,13 +236,13 @@ class Cut(Camera):
         self._sensor, self._columns = sensor, columns
 
     def read(self, first_line: int, count: int) -> Readout:
-        """The columns' part of the lines."""
-        whole = self._sensor.read(first_line, count)
-        return Readout(np.ascontiguousarray(whole.pixels[:, self._columns]), whole.missing)
+        """Return these columns of the sensor's lines."""
+        lines = self._sensor.read(first_line, count)
+        return Readout(np.ascontiguousarray(lines.pixels[:, self._columns]), lines.missing)
 
 
 class _Image:
-    """Expected lines of one arm on a sensor, with the effects on its signal."""
+    """Expected lines of one arm on a sensor, including the effects on its signal."""
 
     def __init__(self, arm: StreamingArm, stages: Sequence[Stage], column: int) -> None:
         self.stages, self.column = stages, column
@@ -260,6 +260,7 @@ class _Image:
         return lines
 
     def _with_history(self, first_line: int, count: int) -> NDArray[Any]:
+        """Return the lines, preceded by ``lead`` others; the last tiles are kept for the next call."""
         first = first_line - self._lead
         tiles = range(first // TILE_LINES, (first_line + count - 1) // TILE_LINES + 1)
         for index in tiles:
@@ -272,7 +273,7 @@ class _Image:
 
 
 def describe(scene: SceneConfig) -> dict[str, Any]:
-    """What a recording of a simulated scene says of it: effects in the order in which they acted (JSON)."""
+    """Return the scene as stored in its recording, with the effects in the order in which they act (JSON)."""
     effects = [effect.model_dump(mode="json") for effect in in_order(scene.effects)]
     return {"simulated": True, "scene": scene.model_dump(mode="json"), "effects": effects}
 
@@ -286,7 +287,7 @@ def _sensor(
     pixels: int,
     merge: int = 1,
 ) -> Sensor:
-    """A sensor with the images of the arms in ``columns`` (arm → first column)."""
+    """Return a sensor with the images of the arms in ``columns`` (arm → first column)."""
     geometry, scene = bench.geometry, bench.fine_scene()
     setting = Setting(
         arm=name,
@@ -317,6 +318,7 @@ def _sensor(
 
 
 def _stages(bench: Bench, setting: Setting) -> list[Stage]:
+    """Return the stages of the listed effects, timed if the bench has a stopwatch."""
     if not bench.scene.effects:
         return []
     from acquire.sim.effects import build_stages
@@ -334,6 +336,10 @@ def _image(
     common: Sequence[Stage],
     own: Sequence[Stage],
 ) -> _Image:
+    """Return the expected lines of ``arm``.
+
+    Effects on the light are ``common`` to the images of a sensor; those on image and signal are its ``own``.
+    """
     factor = optics.baseline_factor if optics.layout == "interline" else 1
     scene = setting.scene
     light = Illumination.of(scene if factor == 1 else binned(scene, factor), code)
@@ -357,6 +363,7 @@ def _image(
 
 
 def _compact(bench: Bench, arm: str, code: Code, converter: Converter) -> Cut:
+    """Return an arm's columns of the one sensor that both arms share."""
     optics, M = bench.scene.optics, bench.geometry.stages
     first = {"a": optics.column_a, "b": optics.column_b}
     if first["b"] is None:
@@ -366,25 +373,26 @@ def _compact(bench: Bench, arm: str, code: Code, converter: Converter) -> Cut:
     if high < low + M or high + M > optics.sensor_pixels:
         raise UsageError(
             f"a compact layout cannot have images of {M} columns at {columns['a']} and {columns['b']}",
-            possible=f"two ranges beside each other on {optics.sensor_pixels} columns",
+            possible=f"two ranges side by side on {optics.sensor_pixels} columns",
         )
     if converter != Converter.of(bench.cameras["b"]) or converter != Converter.of(bench.cameras["a"]):
         raise UsageError(
             "a compact layout cannot have two different cameras",
-            possible="cameras.a and .b alike: it has one",
+            possible="equal cameras.a and cameras.b, since the layout has one camera",
         )
     sensor = _sensor(bench, "ab", code, converter=converter, columns=columns, pixels=optics.sensor_pixels)
     return Cut(sensor, slice(columns[arm], columns[arm] + M))
 
 
 def _emulated(bench: Bench, arm: str, code: Code, converter: Converter) -> Merged:
+    """Return a camera of M·S stages whose raw lines are merged S × S."""
     S = bench.geometry.substeps
     raw_white = (1 << bench.scene.optics.raw_bits) - 1
     if raw_white * S**2 > converter.white_dn:
         raise UsageError(
             f"layout 'emulated': {S} x {S} samples of {bench.scene.optics.raw_bits} bits do not fit into "
             f"lines up to {converter.white_dn} DN",
-            possible="cameras with a wider pixel_format, as Mono16, or fewer optics.raw_bits",
+            possible="cameras with a wider pixel_format, such as Mono16, or fewer optics.raw_bits",
         )
     raw = replace(
         converter, white_dn=raw_white, black_level_dn=converter.black_level_dn / S**2, dtype="uint16"

@@ -1,4 +1,4 @@
-"""Procedural scenes that nothing was tuned on, as an ordinary camera records them.
+"""Procedural scenes, which no parameter was tuned on, as an ordinary camera records them.
 
     bullet    a small dark block crosses a bright textured still
     splash    a blob deforms and throws drops
@@ -15,9 +15,9 @@
     fastled   lamps of 20 kHz and 1 kHz
     still     a textured still
 
-Sizes are shares of the picture, times shares of the span, so that a scene is the same at any M, S and L_R;
-only the lamps blink in sub-steps. The noise is that of a camera of 12 bits whose brightest sample is
-``full_well_e``.
+Sizes are fractions of the picture and times fractions of the span, so that a scene is the same at any M, S
+and L_R; only the lamps have frequencies in sub-steps. The noise is that of a 12-bit camera whose brightest
+sample is ``full_well_e`` electrons.
 """
 
 from __future__ import annotations
@@ -51,14 +51,14 @@ SUBSTEP_HZ = 100e3
 
 @dataclass(frozen=True)
 class Camera:
-    """Noise of EMVA 1288's linear model; ``full_well_e`` electrons make the brightest sample."""
+    """Noise of EMVA 1288's linear model; the brightest sample is ``full_well_e`` electrons."""
 
     full_well_e: float = 1e4
     read_noise_e: float = 10.0
 
     @property
     def noise(self) -> Noise:
-        """Of its samples in DN, of both arms."""
+        """Noise of the samples in DN, for both arms."""
         K = TOP_DN / self.full_well_e
         dark = 0.0 if np.isinf(self.full_well_e) else K * self.read_noise_e
         return Noise((K, K), (dark, dark))
@@ -69,26 +69,26 @@ CLEAN = Camera(np.inf, 0.0)
 
 @dataclass(frozen=True, eq=False)
 class Recorded:
-    """A segment, and the light (T, n, n) that it is of."""
+    """A segment, and the light (T, n, n) that it recorded."""
 
     segment: Segment
     light: NDArray[np.float32]
 
     def truth(self, spatial_merge: int, temporal_merge: int) -> NDArray[np.float32]:
-        """The voxels that a reconstruction should give, frames of the trusted interval."""
+        """Return the voxels that a reconstruction should find, for the trusted frames."""
         video = merge_video(self.light, spatial_merge, temporal_merge)
         return np.asarray(video[self.segment.geometry.trusted_frames(temporal_merge)], np.float32)
 
 
 class Stage:
-    """Coordinates (0 to 1) and random texture of a picture of n × n; every scene draws on one."""
+    """Coordinates (0 to 1) and random texture of an n × n picture, on which a scene is drawn."""
 
     def __init__(self, n: int, span: int, seed: int) -> None:
         self.n, self.span, self.rng = n, span, np.random.default_rng(seed)
         self.y, self.x = np.meshgrid(*[(np.arange(n) + 0.5) / n] * 2, indexing="ij")
 
     def texture(self, *scales: float) -> Image:
-        """Smooth noise of several scales (shares of the picture), from 0 to 1."""
+        """Return smooth noise of several scales (fractions of the picture), from 0 to 1."""
         total = sum(
             gaussian_filter(self.rng.standard_normal((self.n, self.n)), scale * self.n, mode="wrap") * scale
             for scale in scales
@@ -97,7 +97,7 @@ class Stage:
         return np.asarray(np.clip((total - low) / (high - low), 0, 1), np.float32)
 
     def inside(self, distance: Any) -> Image:
-        """1 where a signed distance (shares of the picture) is negative, one pixel soft."""
+        """Return 1 where a signed distance (fractions of the picture) is negative, with a one-pixel edge."""
         return np.asarray(np.clip(0.5 - distance * self.n, 0, 1), np.float32)
 
     def ball(self, y: float, x: float, radius: float) -> Image:
@@ -107,7 +107,7 @@ class Stage:
         return self.inside(np.maximum(abs(self.y - y) - height / 2, abs(self.x - x) - width / 2))
 
     def limb(self, y: float, x: float, angle: float, length: float, width: float) -> Image:
-        """A rounded line from (y, x), ``angle`` from straight down."""
+        """Return a rounded stroke that starts at (y, x), at ``angle`` from straight down."""
         dy, dx = self.y - y, self.x - x
         along = np.clip(dy * np.cos(angle) + dx * np.sin(angle), 0, length)
         return self.inside(np.hypot(dy - along * np.cos(angle), dx - along * np.sin(angle)) - width / 2)
@@ -301,7 +301,7 @@ SCENES = {
 
 
 def light(name: str, seed: int, n: int, span: int) -> NDArray[np.float32]:
-    """The scene (span, n, n)."""
+    """Return the scene as a video (span, n, n)."""
     frame = SCENES[name](Stage(n, span, seed))
     video = np.empty((span, n, n), np.float32)
     for t in range(span):
@@ -318,7 +318,7 @@ def record(
     lines: int = 263,
     camera: Camera = Camera(),
 ) -> Recorded:
-    """The scene as recorded under code ``seed``; scene and noise are of the same seed."""
+    """Return the scene as recorded; ``seed`` determines scene, code and noise."""
     geometry = Geometry(stages, substeps, lines)
     code = prbs(31, mix_seed(seed, 31), 0, geometry.span)
     video = light(name, seed, geometry.size, geometry.span)
@@ -329,7 +329,7 @@ def record(
 def expose(
     exact: NDArray[np.float64], geometry: Geometry, code: NDArray[np.uint8], camera: Camera, seed: int
 ) -> Segment:
-    """Y of Eq. (1) as 12-bit lines of a camera."""
+    """Return Y of Eq. (1) as the 12-bit lines of a camera."""
     rng, top = np.random.default_rng([seed, 1]), exact.max()
     if np.isfinite(camera.full_well_e):
         electrons = rng.poisson(
@@ -354,4 +354,4 @@ def expose(
 
 
 BLACK_DN = 100.0
-"""So that noise about darkness is not cut off."""
+"""Black level, high enough that noise around darkness is not clipped."""

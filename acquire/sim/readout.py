@@ -1,4 +1,4 @@
-"""What a simulated sensor gives when it is read out."""
+"""The lines that a simulated sensor reads out."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class Readout:
-    """Lines as a camera gives them: pixels (count, M), and which of them did not come (count,)."""
+    """Lines as a camera delivers them: pixels (count, M), and which of the lines are missing (count,)."""
 
     pixels: NDArray[Any]
     missing: NDArray[np.bool_]

@@ -1,13 +1,13 @@
-"""Simulated cameras that give a stored stream again: real lines for tests, loads and demonstrations.
+"""Simulated cameras that replay a recording: real lines for tests, load tests and demonstrations.
 
-Line ℓ of the new run is row ℓ of the recording, and its code is the stored one from there on: a register's
-state can be taken at any index (`replay_code`). Lines that were missing are missing again, and what else a
-line was flagged with is replayed with it, as a property of the stored line. Endlessly repeated rows meet a
-code that is not theirs: from the second round on they are flagged as such.
+Line ℓ of the new run is row ℓ of the recording, and the code is the stored one from that row on, since the
+state of the code's register can be computed at any index (`replay_code`). Lines that were missing are missing
+again, and the other flags of a line are replayed with it, as properties of the stored line. Rows repeated in
+a loop meet a code that is not theirs: from the second round on they are flagged as such.
 
-With a ``gate``, a file, no line comes before that file exists: who waits for a recording to begin makes it
-then, however long that takes on a busy host. After the last row come dark lines, which end a recording whose
-own last lines are missing.
+With a ``gate``, which is a file, no line comes before that file exists. The caller creates it once the new
+recording has begun, however long that takes on a busy host. The last row is followed by dark lines, which
+complete a recording whose own last lines are missing.
 """
 
 from __future__ import annotations
@@ -42,11 +42,11 @@ if TYPE_CHECKING:
 _PAGE_LINES = 4096
 _NAP_S = 0.001
 _CATCH_UP = Fraction(5, 4)
-"""Lines per pulse of a camera that is behind."""
+"""Lines per pulse of a camera that catches up."""
 
 
 def replay_code(recording: Recording) -> Code:
-    """The code of a run whose line 0 is the recording's first."""
+    """Return the code of a run whose line 0 is the recording's first line."""
     code = code_from_attrs(recording.attrs["code"])
     index = recording.geometry_for(1).substeps * recording.first_line
     if isinstance(code, PrbsCode):
@@ -54,14 +54,14 @@ def replay_code(recording: Recording) -> Code:
     if isinstance(code, ConstantCode):
         return code
     raise UsageError(
-        f"{recording} cannot be replayed: its code is of kind {recording.attrs['code']['kind']!r}, and a "
-        "simulated trigger generates its code",
+        f"{recording} cannot be replayed: its code is of kind {recording.attrs['code']['kind']!r}, which the "
+        "simulated trigger cannot generate",
         possible="recordings with codes of kind prbs or constant",
     )
 
 
 def describe_replay(path: Path) -> dict[str, Any]:
-    """What a recording of replayed lines says of where they come from: as the first one did (JSON)."""
+    """Return the origin of replayed lines for the new recording, as the first recording states it (JSON)."""
     attrs = open_recording(path).attrs
     kept: dict[str, Any] = {key: attrs[key] for key in ("simulated", "scene", "effects") if key in attrs}
     return {**kept, "replayed": {"run_id": attrs["run_id"], "first_line": attrs["first_line"]}}
@@ -71,7 +71,7 @@ def describe_replay(path: Path) -> dict[str, Any]:
 class ReplayCameraOpener:
     """Opens one arm of a recording as a camera. Picklable.
 
-    No line comes before the file ``gate`` exists, so that a recording can be started before the first.
+    No line comes before the file ``gate`` exists, so that a recording can be started before the first line.
     """
 
     wire: Wire
@@ -86,7 +86,7 @@ class ReplayCameraOpener:
 
 
 class ReplayCamera:
-    """Reads one stored line per pulse on the wire, in blocks; falls silent at the end unless it loops."""
+    """Reads out one stored line per pulse on the wire, in blocks; stops at the end unless it loops."""
 
     def __init__(self, opener: ReplayCameraOpener) -> None:
         self._opener = opener
@@ -108,23 +108,25 @@ class ReplayCamera:
         return CameraIdentity("acquire", "replayed TDI camera", str(self._opener.path), __version__)
 
     def settings(self) -> dict[str, Any]:
-        """As they were recorded."""
+        """Return the settings stored in the recording."""
         return dict(self._recording.attrs["cameras"][self._opener.arm])
 
     def arm(self) -> None:
         """Follow the next train of pulses from its beginning."""
         reading = self._wire.read()
         if reading.running:
-            raise CameraError("a replay was armed while the trigger runs", hint="arm it before the start")
+            raise CameraError(
+                "a replay cannot be armed while the trigger is running", hint="arm it before the start"
+            )
         self._run = reading.run + 1
         self._delivered = self._lost = 0
         self._not_before_ns = 0
         self._ready.clear()
 
     def next_block(self, timeout_s: float) -> CameraBlock | None:
-        """The next lines that are due; at the end, and when all of a block were missing, none."""
+        """Return the next lines that are due; None at the end, and if all lines of a block are missing."""
         if self._run is None:
-            raise CameraError("a block was requested of a camera that is not armed", hint="arm it")
+            raise CameraError("a block was requested from a camera that is not armed", hint="arm it")
         if self._ready:
             return self._ready.popleft()
         deadline_ns = self._wire.clock.monotonic_ns() + int(timeout_s * 1e9)
@@ -136,7 +138,7 @@ class ReplayCamera:
         return self._ready.popleft() if self._ready else None
 
     def release(self, block: CameraBlock) -> None:
-        """Nothing to give back: every block has memory of its own."""
+        """Do nothing: every block has its own memory."""
 
     def disarm(self) -> None:
         self._run = None
@@ -148,13 +150,13 @@ class ReplayCamera:
         self.disarm()
 
     def _deliverable(self) -> int:
-        """Lines of the next block, 0 before its time.
+        """Return the number of lines of the next block, 0 before it is due.
 
-        A camera that fell behind catches up, but no faster than a recorder can take: reading is so much
-        faster than the pulses come that the ring would overflow.
+        A camera that fell behind catches up, but only at a limited rate: stored lines can be read so much
+        faster than pulses come that the ring would overflow.
         """
         now_ns, count, reading = self._wire.clock.monotonic_ns(), self._due(), self._wire.read()
-        # The last block may be a short one: what is missing of it will not come.
+        # The last block may be short, since no further lines will come to fill it.
         last = not self._opener.loop and self._delivered + count >= self._last
         whole = count >= self._opener.block_lines or last or reading.stopped
         if now_ns < self._not_before_ns or not whole:
@@ -166,9 +168,9 @@ class ReplayCamera:
         return count
 
     def _due(self) -> int:
-        """Lines whose pulses have come, and which are not delivered; none while the gate is closed."""
+        """Return the lines whose pulses have come but that are not delivered; 0 while the gate is closed."""
         reading, gate = self._wire.read(), self._opener.gate
-        self._open = self._open or gate is None or gate.exists()  # it is opened once
+        self._open = self._open or gate is None or gate.exists()  # once open, it stays open
         if reading.train is None or reading.run != self._run or not self._open:
             return 0
         issued = reading.train.issued(self._wire.clock.monotonic_ns())
@@ -177,38 +179,38 @@ class ReplayCamera:
 
     @property
     def _last(self) -> int:
-        """Lines in all, unless they are repeated: what comes before line 0, the rows, and the dark tail."""
+        """Total lines without a loop: the preroll before line 0, the rows, and the dark tail."""
         return self._depth_lines + self._rows + self._tail_lines
 
     def _blocks(self, count: int) -> Iterator[CameraBlock]:
-        """The next ``count`` lines, without those that were missing."""
-        at = self._delivered
+        """Return the next ``count`` lines as blocks, without the missing ones."""
+        position = self._delivered
         self._delivered += count
-        while at < self._delivered:
-            line = at - self._depth_lines
+        while position < self._delivered:
+            line, left = position - self._depth_lines, self._delivered - position
             if line < 0:
-                pixels, flags = self._dark(min(-line, self._delivered - at))
+                pixels, flags = self._dark(min(-line, left))
             elif line >= self._rows and not self._opener.loop:
-                pixels, flags = self._dark(self._delivered - at)
+                pixels, flags = self._dark(left)
             else:
-                pixels, flags = self._stored(line, self._delivered - at)
+                pixels, flags = self._stored(line, left)
             missing = (flags & LineFlag.MISSING) != 0
             self._lost += int(missing.sum())
             edges = np.flatnonzero(np.diff(missing, prepend=True, append=True))
             for begin, end in edges.reshape(-1, 2).tolist():
                 yield CameraBlock(
-                    at + begin, pixels[begin:end], flags[begin:end] & ~np.uint16(LineFlag.MISSING)
+                    position + begin, pixels[begin:end], flags[begin:end] & ~np.uint16(LineFlag.MISSING)
                 )
-            at += len(flags)
+            position += len(flags)
 
     def _dark(self, count: int) -> tuple[NDArray[Any], NDArray[np.uint16]]:
-        """What comes before line 0, and after the last: nobody keeps it."""
+        """Return dark lines for before line 0 and after the last, which no recording keeps."""
         pixels = np.zeros((count, self._stream.pixels), self._stream.dtype)
         return pixels, np.zeros(count, np.uint16)
 
     def _stored(self, line: int, count: int) -> tuple[NDArray[Any], NDArray[np.uint16]]:
-        """Rows from ``line`` on, as far as the page that holds it goes."""
-        turn, row = divmod(line, self._rows)
+        """Return rows from ``line`` on, up to ``count`` or the end of the page that holds it."""
+        round_number, row = divmod(line, self._rows)
         page, skip = divmod(row, _PAGE_LINES)
         if self._page is None or self._page[0] != page:
             start, stop = page * _PAGE_LINES, min((page + 1) * _PAGE_LINES, self._rows)
@@ -217,5 +219,5 @@ class ReplayCamera:
             self._page = (page, pixels.astype(self._stream.dtype.newbyteorder("=")), flags)
         _, pixels, flags = self._page
         part = slice(skip, skip + count)
-        again = np.uint16(LineFlag.CODE_UNVERIFIED if turn else 0)
-        return pixels[part], flags[part] | again
+        foreign_code = np.uint16(LineFlag.CODE_UNVERIFIED if round_number else 0)
+        return pixels[part], flags[part] | foreign_code

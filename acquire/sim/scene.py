@@ -1,14 +1,14 @@
-"""What a scene is: light sampled sub-step by sub-step, wherever in time it is asked.
+"""The scene: light sampled sub-step by sub-step, at any time.
 
-A scene has no beginning: sub-steps before the run (negative) exist too, it shines on and the light's code
-alone is dark. Values do not depend on how a stretch of sub-steps is split into calls.
+A scene has no beginning: it also has light in the sub-steps before the run (negative), and only the light's
+code is dark there. Values do not depend on how a range of sub-steps is split into calls.
 
 Sources behind masks are *separable*: ``X[t, r, c] = Σ_k intensity[k, t] · mask[k, r, c]``, which the
 streaming simulation turns into small matrix products. Scenes compose::
 
     sources: LedScene, TargetScene, DigitScene (separable)
              SpriteScene, VideoScene, FunctionScene, ArrayScene
-    SumScene(parts)      light added          ShutteredScene(scene, shutters)      light cut
+    SumScene(parts)      adds light           ShutteredScene(scene, shutters)      blocks light
 """
 
 from __future__ import annotations
@@ -34,16 +34,16 @@ class Scene(Protocol):
     def size(self) -> int: ...
 
     def frames(self, first: int, count: int) -> NDArray[np.float32]:
-        """Mean light during sub-steps ``first .. first + count - 1``: (count, row, column) float32."""
+        """Return the mean light of sub-steps ``first .. first + count - 1``: (count, row, column)."""
         ...
 
 
 @runtime_checkable
 class SparseScene(Scene, Protocol):
-    """A scene that need not be computed where the light is off."""
+    """A scene that need not be computed for sub-steps in which the light is off."""
 
     def frames_at(self, substeps: NDArray[np.int64]) -> NDArray[np.float32]:
-        """(count, row, column) float32 of any sub-steps, ascending."""
+        """Return the frames of any ascending sub-steps: (count, row, column) float32."""
         ...
 
 
@@ -57,12 +57,12 @@ class SeparableScene(Scene, Protocol):
         ...
 
     def intensity(self, first: int, count: int, substep_s: float | None = None) -> NDArray[np.float64]:
-        """(K, count): mean over each sub-step, or over steps of another duration counted from 0."""
+        """Return the mean over each sub-step, or over steps of another length counted from 0: (K, count)."""
         ...
 
 
 def frames_at(scene: Scene, substeps: NDArray[np.int64]) -> NDArray[np.float32]:
-    """Frames at some ascending sub-steps, of a scene of any kind."""
+    """Return the frames of a scene of any kind at ascending sub-steps."""
     if isinstance(scene, SparseScene):
         return scene.frames_at(substeps)
     if not len(substeps):
@@ -72,21 +72,21 @@ def frames_at(scene: Scene, substeps: NDArray[np.int64]) -> NDArray[np.float32]:
 
 
 class SceneModel(SceneBase, ABC):
-    """A kind of scene: a model of its keys, and what it shows. Named by an entry point.
+    """A kind of scene: the model of its keys, which builds the scene. Named by an entry point.
 
-    A scene of files also extends `acquire.config.scene.SceneBase.anchored`.
+    A scene that refers to files also overrides `acquire.config.scene.SceneBase.anchored`.
     """
 
     @abstractmethod
     def build(self, size: int, substep_s: float) -> Scene:
-        """What it shows at ``size`` rows and columns, sub-step 0 at the run's begin; without its shutters.
+        """Return the scene at ``size`` rows and columns, without its shutters; the run begins at sub-step 0.
 
-        Raises UsageError for files and values that are no scene.
+        Raises UsageError for files and values that do not make a scene.
         """
 
 
 class MaskScene(ABC):
-    """Base of separable scenes; a subclass gives ``masks`` and ``intensity``."""
+    """Base of separable scenes; a subclass provides ``masks`` and ``intensity``."""
 
     masks: NDArray[np.float32]
 
@@ -107,21 +107,21 @@ class MaskScene(ABC):
         first, last = (int(substeps[0]), int(substeps[-1])) if len(substeps) else (0, -1)
         light = self.intensity(first, last + 1 - first)[:, substeps - first].astype(np.float32)
         frames: NDArray[np.float32] = np.multiply.outer(light[0], self.masks[0])
-        for mask, of_time in zip(self.masks[1:], light[1:], strict=True):
-            frames += of_time[:, None, None] * mask
+        for mask, level in zip(self.masks[1:], light[1:], strict=True):
+            frames += level[:, None, None] * mask
         return frames
 
 
 class ArrayScene:
     """A given video (time, row, column), one frame per sub-step, in a loop.
 
-    The loop runs in both directions from sub-step 0, so that a run of any length has something to see.
+    The loop extends in both directions from sub-step 0, so that a run of any length is covered.
     """
 
     def __init__(self, video: NDArray[Any]) -> None:
         if video.ndim != 3 or 0 in video.shape or video.shape[1] != video.shape[2]:
             raise UsageError(
-                f"a scene cannot be a video of shape {video.shape}", possible="(time, n, n), nothing empty"
+                f"a scene cannot be a video of shape {video.shape}", possible="(time, n, n), not empty"
             )
         self.video = video
 
@@ -139,7 +139,7 @@ class ArrayScene:
 
 
 class SumScene:
-    """The light of several scenes added."""
+    """The sum of the light of several scenes."""
 
     def __init__(self, parts: Sequence[Scene]) -> None:
         self._parts = parts
@@ -161,18 +161,18 @@ class SumScene:
 
 
 class SumOfMasks(MaskScene):
-    """Separable scenes added are separable."""
+    """The sum of separable scenes, which is separable."""
 
     def __init__(self, parts: Sequence[SeparableScene]) -> None:
         self._parts = parts
         self.masks = np.concatenate([part.masks for part in parts])
 
     def intensity(self, first: int, count: int, substep_s: float | None = None) -> NDArray[np.float64]:
-        """(ΣK, count)."""
+        """Return the intensities of all parts: (ΣK, count)."""
         return np.concatenate([part.intensity(first, count, substep_s) for part in self._parts])
 
 
 def add(parts: Sequence[Scene]) -> Scene:
-    """The sum of scenes, separable where all of them are."""
+    """Return the sum of scenes, which is separable if all of them are."""
     separable = [part for part in parts if isinstance(part, SeparableScene)]
     return SumOfMasks(separable) if len(separable) == len(parts) else SumScene(parts)

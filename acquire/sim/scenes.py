@@ -1,4 +1,4 @@
-"""From a scene's description to the scene, and the sum of several."""
+"""Build a scene from its configuration; the sum of several scenes."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ if TYPE_CHECKING:
 
 
 def build_scene(config: SceneBase, size: int, substep_s: float) -> Scene:
-    """The scene that a configuration describes, at ``size`` rows and columns, behind its shutters.
+    """Return the scene that a configuration describes, at ``size`` rows and columns, behind its shutters.
 
-    UsageError for files, pictures and functions that are no scene.
+    Raises UsageError for files, pictures and functions that do not make a scene.
     """
     scene = cast("SceneModel", config).build(size, substep_s)
     if not config.shutters:
@@ -30,7 +30,7 @@ def build_scene(config: SceneBase, size: int, substep_s: float) -> Scene:
 
 
 class SumSceneConfig(SceneModel):
-    """The light of several scenes added; optics and effects are those of the sum."""
+    """The sum of the light of several scenes; optics and effects are those of the sum."""
 
     kind: Literal["sum"]
     parts: tuple[SceneConfig, ...] = Field(min_length=1)
@@ -39,7 +39,7 @@ class SumSceneConfig(SceneModel):
     def _parts_are_only_light(self) -> SumSceneConfig:
         for part in self.parts:
             if part.effects or part.optics != OpticsConfig():
-                raise ValueError("effects and optics belong to the sum, not to a part of it")
+                raise ValueError("effects and optics belong to the sum of scenes, not to one of its parts")
         return self
 
     def build(self, size: int, substep_s: float) -> Scene:

@@ -1,8 +1,8 @@
 """Shapes of masks with smooth edges.
 
-A shape is the signed distance to its outline in a square of side 1 around the origin: negative inside,
-rows growing downwards. A pixel whose centre lies within half a pixel of the outline is partly covered;
-so a shape moves by fractions of a pixel without a jump.
+A shape is the signed distance to its outline in a square of side 1 around the origin: negative inside, with
+rows counted downwards. A pixel whose centre lies within half a pixel of the outline is partly covered, so
+that a shape moves smoothly by fractions of a pixel.
 """
 
 from __future__ import annotations
@@ -19,13 +19,13 @@ if TYPE_CHECKING:
     Grid = NDArray[np.float64]
 
 _STROKE = 0.11
-"""Half the width of the strokes of x and equals."""
+"""Half the stroke width of "x" and "equals"."""
 _SPREAD = 0.22
-"""Distance of the two bars of equals from the middle."""
+"""Distance of the two bars of "equals" from the middle."""
 
 
 def coverage(shape: str, row: Grid, column: Grid, pixel: float) -> NDArray[np.float32]:
-    """Covered part of pixels (0 to 1, float32) whose centres are (row, column), each of side ``pixel``.
+    """Return the covered fraction (float32) of pixels of side ``pixel`` with centres (row, column).
 
     ``row`` and ``column`` broadcast; lengths are fractions of the shape's bounding square.
     """
@@ -34,7 +34,7 @@ def coverage(shape: str, row: Grid, column: Grid, pixel: float) -> NDArray[np.fl
 
 
 def _both(one: Grid, other: Grid) -> Grid:
-    """What lies inside both outlines."""
+    """Return the intersection of two shapes."""
     distance: Grid = np.maximum(one, other)
     return distance
 
@@ -49,13 +49,13 @@ def _disc(row: Grid, column: Grid) -> Grid:
 
 
 def _triangle(row: Grid, column: Grid) -> Grid:
-    """Apex at the middle of the upper side, the lower side is the base."""
+    """A triangle with its apex in the middle of the upper side; the lower side is its base."""
     flank = (np.abs(column) - (row + 0.5) / 2) * (2 / np.sqrt(5))
     return _both(row - 0.5, flank)
 
 
 def _cross(row: Grid, column: Grid) -> Grid:
-    """Both diagonals, cut off at the bounding square."""
+    """Both diagonals, clipped to the bounding square."""
     diagonals = np.minimum(np.abs(row + column), np.abs(row - column)) / np.sqrt(2)
     return _both(diagonals - _STROKE, _box(row, column))
 

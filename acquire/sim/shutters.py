@@ -1,4 +1,4 @@
-"""What passes before a scene: windows that slide (Fig. 8) and chopper wheels (Fig. 11)."""
+"""Shutters before a scene: sliding windows (Fig. 8) and chopper wheels (Fig. 11)."""
 
 from __future__ import annotations
 
@@ -21,15 +21,15 @@ if TYPE_CHECKING:
 
 
 class Shutter(Protocol):
-    """Something opaque that moves."""
+    """A moving opaque object."""
 
     def cover(self, frames: NDArray[np.float32], substeps: NDArray[np.int64]) -> None:
-        """Take away, in place, the light that does not pass at the middle of each sub-step."""
+        """Remove, in place, the light that is blocked at the middle of each sub-step."""
         ...
 
 
 class ShutteredScene:
-    """A scene behind shutters, the first of them nearest to it."""
+    """A scene behind shutters, of which the first is the nearest to it."""
 
     def __init__(self, scene: Scene, shutters: Sequence[Shutter]) -> None:
         self._scene, self._shutters = scene, shutters
@@ -51,14 +51,14 @@ class ShutteredScene:
 
 
 def build_shutter(config: WindowConfig | ChopperConfig, size: int, substep_s: float) -> Shutter:
-    """The shutter that a configuration describes."""
+    """Return the shutter that a configuration describes."""
     if isinstance(config, WindowConfig):
         return Window(config.phases, size, substep_s)
     return Chopper(config, size, substep_s)
 
 
 class Window:
-    """Phases one after the other, in a loop that began at sub-step 0."""
+    """A sequence of phases in a loop that begins at sub-step 0."""
 
     def __init__(self, phases: tuple[WindowPhase, ...], size: int, substep_s: float) -> None:
         self._phases, self._size, self._substep_s = phases, size, substep_s
@@ -77,7 +77,7 @@ class Window:
 
 
 class Chopper:
-    """A wheel with straight spokes; its edges are seen with the width of a pixel."""
+    """A wheel with straight spokes; its edges are one pixel wide."""
 
     def __init__(self, config: ChopperConfig, size: int, substep_s: float) -> None:
         self._config, self._substep_s = config, substep_s

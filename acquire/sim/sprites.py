@@ -1,7 +1,7 @@
-"""Pictures that move through a scene: two goldfish (Fig. 7), or files of the user.
+"""Pictures that move through a scene: two goldfish (Fig. 7), or the user's files.
 
-A picture is a square of texels drawn four times finer than it will be seen; every frame samples it where
-the fish is at the middle of the sub-step.
+A picture is a square of texels with more resolution than the scene; every frame samples it at the fish's
+position at the middle of the sub-step.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ _TEXELS = 256
 
 
 class SpriteConfig(FrozenModel):
-    """A picture that moves: its centre on a circle, itself turning. Positive is counter-clockwise."""
+    """A moving picture: its centre follows a circle while it rotates. Positive is counter-clockwise."""
 
     picture: str = Field(description='"broad-finned" or "zebra" goldfish, or an image file')
     row: Fraction = Field(description="centre of the orbit")
@@ -37,19 +37,21 @@ class SpriteConfig(FrozenModel):
     orbit_radius: float = Field(default=0.0, ge=0, le=1)
     orbit_hz: float = 0.0
     orbit_phase_deg: float = Field(default=0.0, description="at sub-step 0; 0 is right, 90 above the centre")
-    turn_hz: float | None = Field(default=None, description="absent: it heads along its orbit")
+    turn_hz: float | None = Field(
+        default=None, description="rotation of the picture; absent: it heads along its orbit"
+    )
     turn_phase_deg: float = 0.0
     level: float = Field(default=1.0, gt=0, le=1)
 
     def anchored(self, directory: Path) -> Self:
-        """With its picture named from ``directory`` on."""
+        """Return the sprite with its picture's path resolved from ``directory``."""
         if self.picture in _GOLDFISH:
             return self
         return self.model_copy(update={"picture": str((directory / self.picture).resolve())})
 
 
 class SpritesSceneConfig(SceneModel):
-    """Moving pictures, a later one over an earlier one (Fig. 7)."""
+    """Moving pictures, each drawn over the ones before it (Fig. 7)."""
 
     kind: Literal["sprites"]
     background: Fraction = 0.0
@@ -63,7 +65,7 @@ class SpritesSceneConfig(SceneModel):
 
 
 class SpriteScene:
-    """Moving pictures over an even background."""
+    """Moving pictures over a uniform background."""
 
     def __init__(
         self, sprites: tuple[SpriteConfig, ...], background: float, size: int, substep_s: float
@@ -94,13 +96,13 @@ class _Sprite:
         self._reach_texels = float(np.hypot(*covered.T).max(initial=0)) + 1
 
     def draw(self, frames: NDArray[np.float32], substeps: NDArray[np.int64]) -> None:
-        from acquire.sim.kernels import paste  # compiled code, which reading a scene file does without
+        from acquire.sim.kernels import paste  # compiled code, which is not needed to read a scene file
 
         scale = len(self._picture) / (self._config.size * self._size)
         paste(frames, self._picture, self._alpha, self._places(substeps), scale, self._reach_texels / scale)
 
     def _places(self, substeps: NDArray[np.int64]) -> Grid:
-        """(frame, 4): row and column in pixels, cosine and sine of the heading."""
+        """Return row and column in pixels, cosine and sine of the heading: (frame, 4)."""
         config = self._config
         orbit = self._turns(substeps, config.orbit_hz, config.orbit_phase_deg)
         if config.turn_hz is None:
@@ -119,18 +121,18 @@ class _Sprite:
 
 
 def _picture(name: str) -> Picture:
-    """Light (multiplied by its alpha) and alpha, both (texel, texel); the fish swim to the right."""
-    drawn = _GOLDFISH.get(name)
-    if drawn is None:
+    """Return light (premultiplied by alpha) and alpha, both (texel, texel); the fish face to the right."""
+    draw = _GOLDFISH.get(name)
+    if draw is None:
         from acquire.sim.media import read_picture
 
         return read_picture(Path(name), _TEXELS)
     axis = (np.arange(_TEXELS) + 0.5) / _TEXELS * 2 - 1
-    return drawn(axis[:, None], axis[None, :])
+    return draw(axis[:, None], axis[None, :])
 
 
 def _broad_finned(y: Grid, x: Grid) -> Picture:
-    """A round body, a tail and fins like veils."""
+    """A goldfish with a round body, and with tail and fins like veils."""
     body = _inside(_ellipse(y, x, 0.0, 0.38, 0.24, 0.4))
     tail = _inside(np.maximum(np.abs(y) - (0.12 - 0.85 * (x + 0.0)), np.maximum(x + 0.05, -x - 0.92)))
     tail = tail * _inside(np.hypot(x - 0.05, y) - 0.95) * (1 - _inside(np.abs(y) - 0.25 * (-x - 0.45)))
@@ -143,7 +145,7 @@ def _broad_finned(y: Grid, x: Grid) -> Picture:
 
 
 def _zebra(y: Grid, x: Grid) -> Picture:
-    """A slender body with stripes across, and a forked tail."""
+    """A goldfish with a slender body, stripes across it and a forked tail."""
     body = _inside(_ellipse(y, x, 0.0, 0.15, 0.27, 0.72))
     tail = _inside(np.maximum(np.abs(y) - 0.75 * (-x - 0.42), np.maximum(x + 0.45, -x - 0.92)))
     tail = tail * (1 - _inside(np.abs(y) - 0.9 * (-x - 0.7)))
@@ -159,7 +161,7 @@ def _with_eye(light: Grid, alpha: Grid, y: Grid, x: Grid, at: float) -> Picture:
 
 
 def _ellipse(y: Grid, x: Grid, turn: float, centre: float, height: float, width: float) -> Grid:
-    """About the signed distance to an ellipse, negative inside."""
+    """Return the approximate signed distance to an ellipse, negative inside."""
     u = np.cos(turn) * (x - centre) - np.sin(turn) * y
     v = np.sin(turn) * (x - centre) + np.cos(turn) * y
     distance: Grid = (np.hypot(u / width, v / height) - 1) * min(height, width)
@@ -167,7 +169,7 @@ def _ellipse(y: Grid, x: Grid, turn: float, centre: float, height: float, width:
 
 
 def _inside(distance: Grid) -> Grid:
-    """1 inside, 0 outside, smooth over two texels."""
+    """Return 1 inside and 0 outside, with an edge that is smooth over two texels."""
     return np.clip(0.5 - distance * _TEXELS / 4, 0, 1)
 
 

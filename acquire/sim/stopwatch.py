@@ -1,4 +1,4 @@
-"""How long each stage of a pipeline works by itself, however the stages call one another."""
+"""Measure the exclusive time of each stage of a pipeline, even though stages call one another."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 
 class Stopwatch:
-    """Exclusive times by name: while a timed function runs, its caller's time stands still. One thread."""
+    """Exclusive times by name: while a timed function runs, its caller's time is paused. For one thread."""
 
     def __init__(self) -> None:
         self.seconds: defaultdict[str, float] = defaultdict(float)
@@ -24,19 +24,19 @@ class Stopwatch:
         self._since = 0.0
 
     def timed(self, name: str, work: Callable[..., Any]) -> Callable[..., Any]:
-        """The same function, on the watch."""
+        """Return the same function, timed under ``name``."""
 
-        def watched(*given: Any) -> Any:
-            self._turn(name)
+        def timed_work(*arguments: Any) -> Any:
+            self._switch(name)
             try:
-                return work(*given)
+                return work(*arguments)
             finally:
-                self._turn(None)
+                self._switch(None)
 
-        return watched
+        return timed_work
 
     def stage(self, stage: Stage) -> Stage:
-        """The same stage, on the watch: of light it is the series that take time, not their making."""
+        """Return the same stage, timed. For light the series are timed: setting them up costs nothing."""
         if stage.place != "light":
             return replace(stage, run=self.timed(stage.effect, stage.run))
 
@@ -48,8 +48,8 @@ class Stopwatch:
 
         return replace(stage, run=run)
 
-    def _turn(self, name: str | None) -> None:
-        """Charge what has passed to whoever ran; then ``name`` runs, or None: whoever ran before."""
+    def _switch(self, name: str | None) -> None:
+        """Charge the elapsed time to the running name; then run ``name``, or its caller again if None."""
         now = time.perf_counter()
         if self._running:
             self.seconds[self._running[-1]] += now - self._since

@@ -1,14 +1,14 @@
-"""The USAF 1951 resolution target by its true geometry, and scenes of one driven picture.
+"""The USAF 1951 resolution target in its true geometry, and scenes of one driven picture.
 
 Element e of group g has f = 2^(g + (e − 1)/6) line pairs per mm (MIL-STD-150A): three horizontal and three
-vertical bars, each w = 1/(2f) wide, 5w long and w apart. Groups come in pairs, every pair a quarter of the
-size of the one around it::
+vertical bars, each w = 1/(2f) wide, 5w long and w apart. Groups come in pairs, each a quarter of the size of
+the pair around it::
 
       ┌ g, 2 ─ 6 down ┐  the next pair,   ┌ g + 1, 1 ─ 6 ┐
       │               │  4 × smaller      │ down         │
       └               ┘         ■   g, 1  └              ┘
 
-Bars are rectangles along the axes, so how far a pixel is covered is exact: the product of two overlaps.
+Bars are rectangles along the axes, so the covered fraction of a pixel is exact: the product of two overlaps.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ class UsafSceneConfig(SceneModel):
     def _pairs(self) -> UsafSceneConfig:
         first = self.groups[0]
         if first % 2 or list(self.groups) != list(range(first, first + len(self.groups))):
-            raise ValueError("groups count upwards from an even one, as 2, 3, 4, 5")
+            raise ValueError("groups must count upwards from an even one, as in 2, 3, 4, 5")
         return self
 
     def build(self, size: int, substep_s: float) -> TargetScene:
@@ -56,7 +56,7 @@ class UsafSceneConfig(SceneModel):
 
 @dataclass(frozen=True, slots=True)
 class Bar:
-    """A bright rectangle of the target, in mm from its middle, rows downwards."""
+    """A bright rectangle of the target, in mm from its centre; rows count downwards."""
 
     group: int
     element: int
@@ -77,17 +77,30 @@ def bar_width_mm(group: int, element: int) -> float:
 
 
 def usaf_bars(groups: tuple[int, ...]) -> list[Bar]:
-    """All bars of the groups, which count upwards from an even one."""
+    """Return all bars of the groups, which count upwards from an even one."""
     bars: list[Bar] = []
     for group in groups[::2]:
-        bars += _pair(group, odd=group + 1 in groups)
+        # A pair of groups: the even one, and around the next pair the odd one next to it. Lengths are in
+        # units of the bar width of (g, 1).
+        unit = bar_width_mm(group, 1)
+        left, right, top, bottom = -18.5 * unit, 10.0 * unit, -17.5 * unit, 11.0 * unit
+        row = top
+        for element in range(2, 7):
+            bars += _element(group, element, row, left)
+            row += 7.3 * bar_width_mm(group, element)
+        bars += _element(group, 1, bottom, -1.0 * unit)
+        bars.append(Bar(group, 0, bottom, -10.5 * unit, 5 * unit, 5 * unit))
+        row = top
+        for element in range(1, 7) if group + 1 in groups else ():
+            bars += _element(group + 1, element, row, right)
+            row += 8.5 * bar_width_mm(group + 1, element)
     return bars
 
 
 def usaf_picture(
     groups: tuple[int, ...], size: int, field_mm: float, dark: float = 0.0
 ) -> NDArray[np.float32]:
-    """(size, size): light of the target in the middle of a field, 0 to 1, exact means over pixels."""
+    """Return the light of the target in the middle of a field, as exact means over pixels: (size, size)."""
     covered = np.zeros((size, size))
     for bar in usaf_bars(groups):
         rows = overlap(size, (bar.top / field_mm + 0.5), bar.height / field_mm)
@@ -98,38 +111,21 @@ def usaf_picture(
 
 
 def overlap(size: int, begin: float, length: float) -> NDArray[np.float64]:
-    """Part of each of ``size`` equal pixels of 0 … 1 that begin … begin + length covers."""
+    """Return the fraction of each of ``size`` equal pixels of 0 … 1 that begin … begin + length covers."""
     edges = np.clip(np.arange(size + 1) / size, begin, begin + length)
     return np.diff(edges) * size
 
 
 class TargetScene(MaskScene):
-    """One picture (n, n) whose light is driven as a whole."""
+    """One picture (n, n) with a single drive."""
 
     def __init__(self, picture: NDArray[np.float32], drive: Drive, substep_s: float) -> None:
         self.masks = picture[None]
         self._drive, self._substep_s = drive, substep_s
 
     def intensity(self, first: int, count: int, substep_s: float | None = None) -> NDArray[np.float64]:
-        """(1, count)."""
+        """Return the intensity of the picture: (1, count)."""
         return mean_drive(self._drive, first, count, substep_s or self._substep_s)[None]
-
-
-def _pair(group: int, *, odd: bool) -> Iterator[Bar]:
-    """The bars of an even group and of the odd one beside it. Lengths in the width of the bars of (g, 1)."""
-    unit = bar_width_mm(group, 1)
-    left, right, top = -18.5 * unit, 10.0 * unit, -17.5 * unit
-    row = top
-    for element in range(2, 7):
-        yield from _element(group, element, row, left)
-        row += 7.3 * bar_width_mm(group, element)
-    bottom = 11.0 * unit
-    yield from _element(group, 1, bottom, -1.0 * unit)
-    yield Bar(group, 0, bottom, -10.5 * unit, 5 * unit, 5 * unit)
-    row = top
-    for element in range(1, 7) if odd else ():
-        yield from _element(group + 1, element, row, right)
-        row += 8.5 * bar_width_mm(group + 1, element)
 
 
 def _element(group: int, element: int, top: float, left: float) -> Iterator[Bar]:

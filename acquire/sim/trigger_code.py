@@ -1,4 +1,4 @@
-"""What the trigger's light does, as the registers say: the code's state, and the code on the wire."""
+"""The trigger's light, as its registers define it: the code on the wire, and the state of the code."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 
 def light_attrs(get: Callable[[r.Register], int]) -> dict[str, Any]:
-    """The light's code as cameras read it; off where the LED is, or where they could not follow."""
+    """Return the light's code for the cameras; dark if the LED is off or cameras cannot follow the code."""
     source, mask = get(r.CODE_SOURCE), get(r.PRBS_MASK)
     kind = r.CODE_SOURCE.kind.of(source)
     lit = r.LED.enable.of(get(r.LED))
@@ -28,8 +28,8 @@ def light_attrs(get: Callable[[r.Register], int]) -> dict[str, Any]:
 
 
 def prbs_state(mask: int, seed: int, index: int) -> int:
-    """The register's state at a code index. A step is linear in GF(2): squared, it is two steps."""
-    step = [mask, *(1 << bit for bit in range(63))]  # what becomes of a state with only bit i set
+    """Return the register's state at a code index. A step is linear in GF(2), and its square is two steps."""
+    step = [mask, *(1 << bit for bit in range(63))]  # the next state of a state in which only bit i is set
     state = seed
     while index:
         if index & 1:

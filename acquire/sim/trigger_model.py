@@ -6,10 +6,10 @@
                               │
                               └──▶ Wire ──▶ simulated cameras
 
-Nothing runs between calls: lines, tags and the end of a run are worked out from the time of the call, in
-exact integers. Simulated time runs ``speed`` times as fast as the host's while a run lasts, and as fast as
-the host's otherwise. A run's code must fit the wire's page, so cameras follow pseudo-random and constant
-codes; with a code memory the wire carries the pulses of a dark run.
+Nothing runs between calls: lines, tags and the end of a run are computed from the time of the call, in exact
+integers. Simulated time runs ``speed`` times as fast as the host's during a run, and at the host's speed
+otherwise. A run's code must fit into the wire's page, so cameras follow pseudo-random and constant codes; for
+a code from the code memory the wire carries the pulses of a dark run.
 """
 
 from __future__ import annotations
@@ -59,13 +59,13 @@ _ENDS = {
 
 
 class TriggerModel:
-    """One device. Thread-safe; never waits.
+    """One trigger. Thread-safe; never waits.
 
     Parameters
     ----------
-    wire : carries the pulses to the simulated cameras; its clock is the device's
-    clock_hz : frequency of the device's clock
-    speed : simulated seconds per second while a run lasts
+    wire : carries the pulses to the simulated cameras, and supplies the clock
+    clock_hz : frequency of the trigger's clock
+    speed : simulated seconds per second during a run
     """
 
     def __init__(self, wire: Wire, clock_hz: int, speed: float = 1.0, serial: int = 0) -> None:
@@ -81,12 +81,7 @@ class TriggerModel:
         self._pps: tuple[int, int] = (0, 0)
         self._clock_losses = 0
         self._locked = True
-        self.registers = RegisterBank(
-            constants(clock_hz, serial), self._status_values(), self._command, self._demand_rest
-        )
-
-    def _status_values(self) -> dict[r.Register, Callable[[], int]]:
-        return {
+        status: dict[r.Register, Callable[[], int]] = {
             r.STATUS: self._status,
             r.CURRENT_RUN: lambda: self._run.number,
             r.TIME: lambda: self._tick() & (1 << r.TIME_BITS) - 1,
@@ -100,21 +95,22 @@ class TriggerModel:
             r.PPS_TIME: lambda: self._pps[0],
             r.PPS_COUNT: lambda: self._pps[1],
         }
+        self.registers = RegisterBank(constants(clock_hz, serial), status, self._command, self._demand_idle)
 
-    # The link's side.
+    # The link.
 
     @property
     def busy(self) -> bool:
-        """Its time is the host's and passes anyway."""
+        """Always False: its time is the host's, and passes without further calls."""
         return False
 
     def feed(self, data: bytes) -> None:
-        """Bytes from the host."""
+        """Take bytes from the host."""
         with self._lock:
             for frame in self._decoder.feed(data):
-                self._advance()  # what was due before the request has happened before it
+                self._advance()  # everything that was due before the request happens before it
                 try:
-                    kind, payload = self._obey(frame)
+                    kind, payload = self._execute(frame)
                 except FrameLengthError:
                     kind, payload = FrameType.NAK, nak_payload(ErrorCode.BAD_LENGTH, 0)
                 except Refusal as refusal:
@@ -122,7 +118,7 @@ class TriggerModel:
                 self._out.append(encode(Frame(kind, frame.sequence, payload)))
 
     def take(self) -> bytes:
-        """Bytes for the host: all that is due."""
+        """Return all bytes that are due for the host."""
         with self._lock:
             self._advance()
             data = b"".join((*self._out, *self._tags))
@@ -132,28 +128,28 @@ class TriggerModel:
 
     @property
     def frames_heard(self) -> int:
-        """Requests so far."""
+        """Number of requests received so far."""
         return self._decoder.frames
 
     # The inputs.
 
     def external_edge(self) -> None:
-        """The external arm input goes to its active level."""
+        """Simulate the external arm input going to its active level."""
         with self._lock:
             self._advance()
             if self.registers.field(r.EXTERNAL_ARM, "enable") and self._run.state == State.ARMED:
                 self._begin(external=True)
 
     def pps_edge(self) -> None:
-        """A second of the reference begins."""
+        """Simulate the beginning of a second of the reference."""
         with self._lock:
             self._advance()
             self._pps = (self._tick(), self._pps[1] + 1)
             if self._run.state in (State.RUNNING, State.STOPPING):
-                self._tell(self._record(self._run.lines, self._tick(), TagFlag.PPS))
+                self._queue_tag(self._record(self._run.lines, self._tick(), TagFlag.PPS))
 
     def lose_clock(self, lost: bool = True) -> None:
-        """The reference clock goes away, or comes back. A run under way ends."""
+        """Simulate the loss of the reference clock, which ends a run, or its return."""
         with self._lock:
             self._advance()
             self._locked = not lost
@@ -163,33 +159,43 @@ class TriggerModel:
 
     # Requests.
 
-    def _obey(self, frame: Frame) -> tuple[FrameType, bytes]:
+    def _execute(self, frame: Frame) -> tuple[FrameType, bytes]:
         if frame.version != r.PROTOCOL_VERSION:
             raise Refusal(ErrorCode.BAD_VERSION, 0)
         if frame.type == FrameType.READ:
             address, count = parse_read(frame.payload)
-            self._hear(self._tick())
+            self._feed_watchdog(self._tick())
             return FrameType.DATA, write_payload(address, self.registers.read(address, count))
         if frame.type == FrameType.WRITE:
             address, words = parse_write(frame.payload)
-            self._hear(self._tick())  # before the words: one that is refused came from a living host, too
+            self._feed_watchdog(
+                self._tick()
+            )  # before the words: a refused one also shows that the host lives
             for i, word in enumerate(words):
                 self.registers.write(address + i, word)
             return FrameType.ACK, frame.payload[:2] + bytes([len(words)])
         raise Refusal(ErrorCode.BAD_TYPE, 0)
 
     def _command(self, word: int) -> None:
-        number = self.registers.get(r.RUN_ID)
-        commands: dict[int, Callable[[int], None]] = {
-            Command.ARM: self._arm,
-            Command.START: self._start,
-            Command.STOP: self._stop,
-            Command.CHECK_CODE: self._check_code,
-            Command.SELF_TEST: self._self_test,
-        }
-        if word not in commands:
-            raise Refusal(ErrorCode.BAD_COMMAND, r.COMMAND.address)
-        commands[word](number)
+        number, at = self.registers.get(r.RUN_ID), r.COMMAND.address
+        match word:
+            case Command.ARM:
+                self._arm(number)
+            case Command.START:
+                self._start(number)
+            case Command.STOP:
+                if number not in (0, self._run.number):
+                    raise Refusal(ErrorCode.WRONG_RUN, at)
+                self._end(EndReason.STOPPED)
+            case Command.CHECK_CODE:
+                self._demand_idle(at)
+                self.registers.check_code()
+            case Command.SELF_TEST:
+                self._demand_idle(at)
+                self.registers.clear_code()
+                self.registers.put(r.SELF_TEST, r.SELF_TEST.pack(done=1))
+            case _:
+                raise Refusal(ErrorCode.BAD_COMMAND, at)
 
     def _arm(self, number: int) -> None:
         run, at = self._run, r.COMMAND.address
@@ -198,8 +204,8 @@ class TriggerModel:
         if number == run.number and run.state != State.IDLE:
             if run.state == State.ENDED:
                 raise Refusal(ErrorCode.RUN_OVER, at)
-            return  # its answer was lost, and it was sent again
-        self._demand_rest(at)
+            return  # a repeated command: the host did not receive the answer to the first
+        self._demand_idle(at)
         try:
             check_configuration(self.registers.get, self._locked, self.registers.code_checked)
         except Refusal as refusal:
@@ -220,23 +226,8 @@ class TriggerModel:
         if run.state == State.ARMED:
             self._begin(external=False)
 
-    def _stop(self, number: int) -> None:
-        if number not in (0, self._run.number):
-            raise Refusal(ErrorCode.WRONG_RUN, r.COMMAND.address)
-        self._end(EndReason.STOPPED)
-
-    def _check_code(self, number: int) -> None:
-        del number
-        self._demand_rest(r.COMMAND.address)
-        self.registers.check_code()
-
-    def _self_test(self, number: int) -> None:
-        del number
-        self._demand_rest(r.COMMAND.address)
-        self.registers.clear_code()
-        self.registers.put(r.SELF_TEST, r.SELF_TEST.pack(done=1))
-
-    def _demand_rest(self, address: int) -> None:
+    def _demand_idle(self, address: int) -> None:
+        """Raise Refusal while a run is armed or running."""
         if self._run.state not in (State.IDLE, State.ENDED):
             raise Refusal(ErrorCode.BUSY, address)
 
@@ -248,12 +239,14 @@ class TriggerModel:
         latency = START_LATENCY + self._lead()
         run.start_tick, run.state, run.external = now_tick + latency, State.RUNNING, external
         rate = self._clock_hz * self._speed / NS_PER_S
-        start_ns = now_ns + -(-latency * rate.denominator // rate.numerator)  # up: not before its tick
+        start_ns = now_ns + -(
+            -latency * rate.denominator // rate.numerator
+        )  # rounded up: not before its tick
         self._zero = (start_ns, run.start_tick, self._speed)
-        self._hear(run.start_tick - self._lead() - RUN_CLOCKS)
+        self._feed_watchdog(run.start_tick - self._lead() - RUN_CLOCKS)
         period_ns = Fraction(run.line_clocks * NS_PER_S, self._clock_hz)
         attrs = light_attrs(self.registers.get)
-        # arm → how much later its line starts than the light of the line's first sub-step
+        # arm → delay of its line's start after the light of the line's first sub-step
         delays = {"a": r.TRIGGER_A_DELAY, "b": r.TRIGGER_B_DELAY}
         settled_s = {
             arm: (self._lead() + self.registers.get(delay)) / self._clock_hz for arm, delay in delays.items()
@@ -271,10 +264,10 @@ class TriggerModel:
             lit_part=lit_part,
         )
 
-    def _hear(self, tick: int) -> None:
-        """The host lived at ``tick``: that is what it may be silent from.
+    def _feed_watchdog(self, tick: int) -> None:
+        """Restart the watchdog's period at ``tick``, when the host was last heard.
 
-        A host lives in its own time: simulated time that runs faster does not make it silent any sooner.
+        The period is in the host's time: simulated time that runs faster does not shorten it.
         """
         run, period = self._run, self.registers.get(r.WATCHDOG)
         if run.state != State.RUNNING or not period:
@@ -284,32 +277,32 @@ class TriggerModel:
             self._wire.allow(self._lines_allowed() or 0)
 
     def _lines_allowed(self) -> int | None:
-        """Lines that the run has if nothing is heard of the host any more; None: no end."""
+        """Return the lines of the run if the host stays silent from now on; None if it then never ends."""
         run = self._run
         if run.bark_tick is None:
             return run.budget
-        settled = self._lead() + 1  # clocks ahead of a line: whether it comes
-        silent = max(1, -(-(run.bark_tick + settled - run.start_tick) // run.line_clocks))
+        decided = self._lead() + 1  # clocks before a line at which it is decided whether it comes
+        silent = max(1, -(-(run.bark_tick + decided - run.start_tick) // run.line_clocks))
         return silent if run.budget is None else min(silent, run.budget)
 
     def _lead(self) -> int:
         return self.registers.field(r.LED, "lead")
 
     def _advance(self) -> None:
-        """Let everything happen that is due by now."""
+        """Carry out everything that is due by now."""
         run = self._run
         if run.state not in (State.RUNNING, State.STOPPING):
             return
-        tick = self._tick()  # before the look: what is over by then has issued all its lines
+        tick = self._tick()  # taken before reading the wire, which has then issued all lines up to it
         lines = self._wire.read().issued
-        self._tell_lines(run.lines, lines)
+        self._queue_line_tags(run.lines, lines)
         run.lines = lines
         self._expire(tick)
         if run.limit is not None and tick >= (end := run.start_tick + run.limit * run.line_clocks):
             self._finish(run.reason, end)
 
     def _expire(self, tick: int) -> None:
-        """The last line of the budget begins, or the watchdog barks, whichever comes first."""
+        """Begin to stop when the budget's last line begins or the watchdog expires, whichever comes first."""
         run = self._run
         ends = [(run.bark_tick, EndReason.WATCHDOG)] if run.bark_tick is not None else []
         if run.budget is not None:
@@ -320,7 +313,7 @@ class TriggerModel:
                 run.state, run.reason, run.limit = State.STOPPING, reason, self._lines_allowed()
 
     def _end(self, reason: EndReason) -> None:
-        """At once where no line has begun; else after the line that runs, which cameras may have seen."""
+        """End the run: at once before line 0, else after the current line, which cameras may have seen."""
         run = self._run
         if run.state == State.ARMED:
             run.limit = 0
@@ -335,21 +328,23 @@ class TriggerModel:
             self._wire.stop()
         run.state, run.reason = State.ENDED, reason
         flags = TagFlag.LAST | _ENDS.get(reason, TagFlag(0))
-        self._tell(self._record(run.lines, tick, flags if run.lines else flags | TagFlag.NO_LINES))
+        self._queue_tag(self._record(run.lines, tick, flags if run.lines else flags | TagFlag.NO_LINES))
         now_ns = self._wire.clock.monotonic_ns()
         self._zero = (now_ns, self._tick_at(now_ns), Fraction(1))
 
-    def _tell_lines(self, told: int, lines: int) -> None:
+    def _queue_line_tags(self, first: int, end: int) -> None:
+        """Queue the tags of lines ``first`` to ``end - 1``, at every interval."""
         run, every = self._run, self.registers.get(r.TAG_INTERVAL)
-        due = range(-(-told // every) * every, lines, every)
+        due = range(-(-first // every) * every, end, every)
         for number, line in enumerate(due):
-            if len(self._tags) >= TAG_ROOM:  # none is taken meanwhile: a late host need not wait for the rest
-                self._lose(len(due) - number)
+            # No tag is taken in the meantime, so the rest are lost, too: a late host need not wait for them.
+            if len(self._tags) >= TAG_ROOM:
+                self._lose_tags(len(due) - number)
                 return
             flags = TagFlag.LINE
             if line == 0:
                 flags |= TagFlag.FIRST | (TagFlag.EXTERNAL if run.external else TagFlag(0))
-            self._tell(self._record(line + 1, run.start_tick + line * run.line_clocks, flags))
+            self._queue_tag(self._record(line + 1, run.start_tick + line * run.line_clocks, flags))
 
     def _record(self, lines: int, tick: int, flags: int) -> TagRecord:
         run, line = self._run, max(0, lines - 1)
@@ -357,10 +352,11 @@ class TriggerModel:
         time = tick & (1 << r.TIME_BITS) - 1
         return TagRecord(run.number & _WORD, line, line * substeps, time, int(flags))
 
-    def _tell(self, record: TagRecord) -> None:
+    def _queue_tag(self, record: TagRecord) -> None:
+        """Queue a tag for the host, or lose it if the queue is full."""
         run = self._run
         if len(self._tags) >= TAG_ROOM:
-            self._lose(1)
+            self._lose_tags(1)
             return
         number, run.made = run.made, run.made + 1
         if run.gap:
@@ -368,8 +364,8 @@ class TriggerModel:
         self._tags.append(encode(Frame(FrameType.TAG, number & 0xFFFF, r.pack_tag(record))))
         run.peak = max(run.peak, len(self._tags))
 
-    def _lose(self, count: int) -> None:
-        """So many tags find no room."""
+    def _lose_tags(self, count: int) -> None:
+        """Account for ``count`` tags that find no room."""
         run = self._run
         run.made, run.lost, run.gap = run.made + count, run.lost + count, True
 

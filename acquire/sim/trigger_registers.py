@@ -1,4 +1,4 @@
-"""The words of the model's device: what it holds, what it says of itself, what may be written when."""
+"""The registers of the trigger model: their contents, its constants, and what may be written when."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ TAG_ROOM = 1 << 15
 RX_BYTES = 2048
 START_LATENCY = 6
 RUN_CLOCKS = 2
-"""From the clock that starts a run to line 0, less LED.lead: the run's first clock is one later."""
+"""Clocks from the start of a run to line 0, less LED.lead: the run's first clock is one later."""
 BARK_CLOCKS = 2
-"""From the last silent clock that the watchdog allows to its bark."""
+"""Clocks from the last silent clock that the watchdog allows to the end that it causes."""
 SUBSTEP_MIN = 5
 SUBSTEP_MAX_LOG2 = 24
 LEAD_MARGIN = 1
@@ -29,13 +29,14 @@ _REGISTER_AT = {register.address + i: register for register in r.REGISTERS for i
 
 
 class RegisterBank:
-    """Registers and code memory of one device.
+    """Registers and code memory of one trigger.
 
     Parameters
     ----------
-    status : makes the value of each register that changes by itself
-    command : carries out what is written to COMMAND, or raises Refusal
-    demand_rest : raises Refusal, about an address, while a run is armed or running
+    constants : initial values that differ from the registers' reset values
+    status : computes the value of each register that the trigger itself changes
+    command : carries out a word written to COMMAND, or raises Refusal
+    demand_idle : raises Refusal, with an address, while a run is armed or running
     """
 
     def __init__(
@@ -43,9 +44,9 @@ class RegisterBank:
         constants: Mapping[r.Register, int],
         status: Mapping[r.Register, Callable[[], int]],
         command: Callable[[int], None],
-        demand_rest: Callable[[int], None],
+        demand_idle: Callable[[int], None],
     ) -> None:
-        self._status, self._command, self._demand_rest = status, command, demand_rest
+        self._status, self._command, self._demand_idle = status, command, demand_idle
         self._words: dict[int, int] = {}
         for register in r.REGISTERS:
             self.put(register, constants.get(register, register.reset))
@@ -60,11 +61,11 @@ class RegisterBank:
             self._words[register.address + i] = word
 
     def field(self, register: r.Register, name: str) -> int:
-        """One field of a register."""
+        """Return one field of a register."""
         return register.field(name).of(self.get(register))
 
     def check_code(self) -> None:
-        """CODE_CRC becomes that of the code memory in use."""
+        """Set CODE_CRC to the checksum of the code memory in use."""
         length = self.get(r.CODE_LENGTH)
         if not 0 < length <= CODE_BITS:
             raise Refusal(ErrorCode.BAD_CODE_LENGTH, r.CODE_LENGTH.address)
@@ -72,33 +73,29 @@ class RegisterBank:
         self.code_checked = True
 
     def clear_code(self) -> None:
-        """The code memory becomes 0."""
+        """Set the code memory to 0."""
         self._memory[:] = bytes(len(self._memory))
         self.code_checked = False
 
     def read(self, address: int, count: int) -> list[int]:
-        """Words, all of one moment; Refusal, about the first of them, where there are not so many."""
+        """Return words, all from one moment. Raises Refusal, with the first address, if any is not there."""
         in_code = address >= r.CODE_MEMORY
         if address + count > (r.CODE_MEMORY + len(self._memory) // 4 if in_code else r.MAP_END):
             raise Refusal(ErrorCode.BAD_ADDRESS, address)
         if in_code:
-            self._demand_rest(address)
+            self._demand_idle(address)
+            at = (address - r.CODE_MEMORY) * 4
+            return [int.from_bytes(self._memory[i : i + 4], "little") for i in range(at, at + 4 * count, 4)]
         for register, value in self._status.items():
             if register.address < address + count and register.address + register.words > address:
                 self.put(register, value())
-        return [self._read_word(address + i) for i in range(count)]
-
-    def _read_word(self, address: int) -> int:
-        at = (address - r.CODE_MEMORY) * 4
-        if 0 <= at < len(self._memory):
-            return int.from_bytes(self._memory[at : at + 4], "little")
-        return self._words.get(address, 0)
+        return [self._words.get(address + i, 0) for i in range(count)]
 
     def write(self, address: int, word: int) -> None:
-        """One word, and what follows from it; Refusal for what cannot be written, or not now."""
+        """Write one word, with its effects. Raises Refusal if it cannot be written, or not now."""
         at = (address - r.CODE_MEMORY) * 4
         if 0 <= at < len(self._memory):
-            self._demand_rest(address)
+            self._demand_idle(address)
             self._memory[at : at + 4] = word.to_bytes(4, "little")
             self.code_checked = False
             return
@@ -116,15 +113,15 @@ class RegisterBank:
             self._command(word)
             return
         if register.access == "config":
-            self._demand_rest(address)
+            self._demand_idle(address)
         if register is r.CODE_LENGTH and word != self._words[address]:
             self.code_checked = False
-        kept = (1 << min(32, register.width - 32 * (address - register.address))) - 1
-        self._words[address] = word & kept
+        implemented = (1 << min(32, register.width - 32 * (address - register.address))) - 1
+        self._words[address] = word & implemented
 
 
 def constants(clock_hz: int, serial: int) -> dict[r.Register, int]:
-    """What the model says of itself."""
+    """Return the registers in which the model describes itself."""
     return {
         r.VERSION: r.VERSION.pack(
             protocol=r.PROTOCOL_VERSION, firmware_major=1, firmware_minor=0, board=r.Board.MODEL

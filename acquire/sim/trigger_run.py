@@ -1,4 +1,4 @@
-"""What the model's device knows of its run."""
+"""The state of the trigger model's run."""
 
 from __future__ import annotations
 
@@ -16,17 +16,17 @@ class Run:
     reason: EndReason = EndReason.NONE
     start_tick: int = 0
     lines: int = 0
-    """Lines that are told of in tags so far; at the end, all."""
+    """Lines accounted for so far; at the end, all."""
     line_clocks: int = 1
     external: bool = False
     made: int = 0
     lost: int = 0
     gap: bool = False
-    """Tags have been lost since the last one that was not."""
+    """True if tags have been lost since the last one that was queued."""
     peak: int = 0
     budget: int | None = None
-    """Lines after which it ends in any case."""
+    """Lines after which the run ends in any case."""
     bark_tick: int | None = None
-    """When the watchdog ends it, should nothing be heard of the host until then."""
+    """Time at which the watchdog ends the run, unless the host is heard before."""
     limit: int | None = None
-    """Lines after which it ends: settled."""
+    """Final number of lines of a run that is stopping."""

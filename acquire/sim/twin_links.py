@@ -1,4 +1,4 @@
-"""Ways to a twin of the trigger's device: a call in this process, or a pseudo-terminal like a real port."""
+"""Links to a twin of the trigger: a call in this process, or a pseudo-terminal that acts as a real port."""
 
 from __future__ import annotations
 
@@ -11,17 +11,17 @@ from typing import Protocol
 
 from acquire.errors import TriggerError
 
-_LOOK_S = 0.005
-"""A twin is asked this often for what is due."""
+_POLL_S = 0.005
+"""Interval at which a twin is polled for bytes that are due."""
 _END_S = 5.0
 
 
 class Twin(Protocol):
-    """Bytes in, bytes out, as `TriggerModel`; neither call waits for anything outside."""
+    """Bytes in, bytes out, as in `TriggerModel`; neither call waits for anything outside."""
 
     @property
     def busy(self) -> bool:
-        """It needs to be asked again at once: its time passes only within `take`."""
+        """True if `take` must be called again at once, because the twin's time passes only within it."""
         ...
 
     def feed(self, data: bytes) -> None: ...
@@ -30,7 +30,7 @@ class Twin(Protocol):
 
 
 class TwinTransport:
-    """The twin at the end of a function call; `unplug` does what its name says."""
+    """A twin reached by function calls; `unplug` simulates an unplugged cable."""
 
     def __init__(self, twin: Twin, name: str = "simulated trigger") -> None:
         self.name = name
@@ -42,7 +42,7 @@ class TwinTransport:
     def read(self) -> bytes:
         self._demand_plugged()
         data = self._twin.take()
-        if not data and self._fed.wait(_LOOK_S):
+        if not data and self._fed.wait(_POLL_S):
             self._fed.clear()
             data = self._twin.take()
         return data
@@ -53,7 +53,7 @@ class TwinTransport:
         self._fed.set()
 
     def close(self) -> None:
-        """Nothing to release."""
+        """Do nothing: there is nothing to release."""
 
     def unplug(self) -> None:
         self._unplugged = True
@@ -65,9 +65,9 @@ class TwinTransport:
 
 
 class PtyTwin:
-    """Owns a thread that carries the bytes between a twin and a pseudo-terminal, whose ``path`` is a port.
+    """Owns a thread that carries bytes between a twin and a pseudo-terminal; ``path`` names the port.
 
-    `close` ends the thread and takes the port away: a driver sees it unplugged. Idempotent.
+    `close` ends the thread and removes the port, which a driver sees as unplugged. Idempotent.
     """
 
     def __init__(self, twin: Twin) -> None:
@@ -75,11 +75,11 @@ class PtyTwin:
         self._master, slave = os.openpty()
         tty.setraw(slave)
         self.path = os.ttyname(slave)
-        # Held open until somebody else may hold it: a terminal without a user reads as hung up.
+        # Held open until a driver opens it: a terminal that nobody holds open reads as hung up.
         self._slave = slave
         os.set_blocking(self._master, False)
         self._ending = threading.Event()
-        self._thread = threading.Thread(target=self._live, name="acquire-pty-twin", daemon=True)
+        self._thread = threading.Thread(target=self._carry_bytes, name="acquire-pty-twin", daemon=True)
         self._thread.start()
 
     def close(self) -> None:
@@ -89,16 +89,16 @@ class PtyTwin:
             os.close(self._slave)
             os.close(self._master)
 
-    def _live(self) -> None:
+    def _carry_bytes(self) -> None:
         out = b""
         while not self._ending.is_set():
             writers = [self._master] if out else []
-            wait_s = 0 if self._twin.busy and not out else _LOOK_S
+            wait_s = 0 if self._twin.busy and not out else _POLL_S
             readable, writable, _ = select.select([self._master], writers, [], wait_s)
             if readable:
                 self._twin.feed(os.read(self._master, 4096))
             if writable:
-                with contextlib.suppress(BlockingIOError):  # the terminal's 20 KB are full
+                with contextlib.suppress(BlockingIOError):  # the terminal's buffer of 20 KB is full
                     out = out[os.write(self._master, out) :]
-            if not out:  # else the device's own queues have to wait, and to lose
+            if not out:  # otherwise tags wait in the trigger's own queue, and are lost there when it is full
                 out = self._twin.take()

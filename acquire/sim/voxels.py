@@ -1,4 +1,4 @@
-"""The truth about a simulated scene, in the voxels that a reconstruction gives."""
+"""Ground truth of a simulated scene, in the voxels of a reconstruction."""
 
 from __future__ import annotations
 
@@ -14,20 +14,22 @@ if TYPE_CHECKING:
     from acquire.sim.scene import Scene
 
 _BLOCK_BYTES = 16 << 20
-"""Frames at full resolution held at once."""
+"""Size of the block of full-resolution frames held in memory."""
 
 
 def truth(
     scene: Scene, first_substep: int, count: int, spatial_merge: int = 1, temporal_merge: int = 1
 ) -> NDArray[np.float32]:
-    """Mean light of each voxel of N_m × N_m pixels and T_m sub-steps: (⌈count/T_m⌉, ⌈n/N_m⌉, ⌈n/N_m⌉).
+    """Return the mean light of each voxel of N_m × N_m pixels and T_m sub-steps.
 
-    Voxels begin at ``first_substep``. The last ones along an axis are averaged over what there is of them.
-    The scene is sampled in blocks; only the result is held whole.
+    The result is (⌈count/T_m⌉, ⌈n/N_m⌉, ⌈n/N_m⌉). Voxels begin at ``first_substep``; the last ones along an
+    axis are averaged over the part of them that exists. The scene is sampled in blocks; only the result is
+    held in full.
     """
     if count < 1 or temporal_merge < 1 or not 1 <= spatial_merge <= scene.size:
         raise UsageError(
-            f"a truth cannot have {count} sub-steps with N_m = {spatial_merge}, T_m = {temporal_merge}",
+            f"the ground truth of {count} sub-steps cannot be computed with N_m = {spatial_merge}, "
+            f"T_m = {temporal_merge}",
             possible=f"at least 1 sub-step, N_m from 1 to {scene.size}, T_m of 1 or more",
         )
     side = -(-scene.size // spatial_merge)
@@ -44,7 +46,7 @@ def truth(
 
 
 def _merge_plane(frames: NDArray[np.float32], spatial_merge: int) -> NDArray[np.float64]:
-    """Mean over blocks of rows and columns."""
+    """Return the mean over blocks of rows and columns."""
     size = frames.shape[1]
     starts = np.arange(0, size, spatial_merge)
     extent = np.diff([*starts, size])

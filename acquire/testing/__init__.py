@@ -1,17 +1,17 @@
-"""Contract suites: what every effect, scene, solver, denoiser and driver must do, as tests for anybody.
+"""Contract suites: tests that every effect, scene, solver, denoiser and driver must pass, for plug-ins, too.
 
 ::
 
-    cameras     CameraContract      a way to a camera, and what its lines must be
+    cameras     CameraContract      a camera driver, and the lines that it delivers
     triggers    TriggerContract     a sync trigger
     effects     EffectContract      an effect on a small bench
-    scenes      SceneContract       a scene, asked for its light in several ways
-    solvers     SolverContract      a solver on noisy lines of a scene that is known
+    scenes      SceneContract       a scene whose light is requested in several ways
+    solvers     SolverContract      a solver on noisy lines of a known scene
                 DenoiserContract    a denoiser of frames
     adjoints    assert_adjoint      an operator and its transpose
 
-A suite is a class: extend it in a test module of your own, give it the fixture that its docstring asks for,
-and pytest does the rest. Ours are tested by the same classes. Needs pytest, and nothing else here does.
+A suite is a class: extend it in your own test module and provide the fixture that its docstring names; pytest
+collects the tests. The built-in classes are tested with the same suites. Only this package needs pytest.
 """
 
 from typing import TYPE_CHECKING
@@ -38,7 +38,7 @@ _HOMES = {
     "TriggerContract": "triggers",
     "assert_adjoint": "adjoints",
 }
-"""Imported when they are asked for: who tests a camera need not have the solvers' libraries."""
+"""Imported on first use, so that tests of a camera do not need the solvers' libraries."""
 
 pytest.register_assert_rewrite(*sorted({f"{__name__}.{home}" for home in _HOMES.values()}))
 

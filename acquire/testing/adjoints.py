@@ -1,4 +1,4 @@
-"""A linear map and its transpose."""
+"""Test a linear map against its transpose."""
 
 from __future__ import annotations
 
@@ -17,17 +17,17 @@ if TYPE_CHECKING:
 def assert_adjoint(
     forward: Map, adjoint: Map, shape: tuple[int, ...], *, seed: int = 0, rtol: float = 1e-9
 ) -> None:
-    """⟨A·x, y⟩ = ⟨x, Aᵀ·y⟩ for random x of ``shape`` and random y of the shape of A·x, in float64.
+    """Assert ⟨A·x, y⟩ = ⟨x, Aᵀ·y⟩ for random x of ``shape`` and random y of the shape of A·x, in float64.
 
-    ``rtol`` is relative to ‖A·x‖·‖y‖, which no cancellation makes small; float32 needs about 1e-5.
+    ``rtol`` is relative to ‖A·x‖·‖y‖, which cannot become small by cancellation; float32 needs about 1e-5.
     """
     draws = np.random.default_rng(seed)
     x = draws.standard_normal(shape)
-    seen = forward(x)
-    y = draws.standard_normal(seen.shape)
+    image = forward(x)
+    y = draws.standard_normal(image.shape)
     back = adjoint(y)
-    assert back.shape == x.shape, f"the transpose gives {back.shape} for an x of {x.shape}"
-    gap = abs(float(np.vdot(seen, y)) - float(np.vdot(x, back)))
-    scale = float(np.linalg.norm(seen) * np.linalg.norm(y))
-    assert scale > 0, "the map gives nothing but zeros"
+    assert back.shape == x.shape, f"the transpose returns shape {back.shape} for an x of shape {x.shape}"
+    gap = abs(float(np.vdot(image, y)) - float(np.vdot(x, back)))
+    scale = float(np.linalg.norm(image) * np.linalg.norm(y))
+    assert scale > 0, "the map returns only zeros"
     assert gap <= rtol * scale, f"⟨A·x, y⟩ and ⟨x, Aᵀ·y⟩ differ by {gap / scale:.2g} of ‖A·x‖·‖y‖"

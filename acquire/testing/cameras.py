@@ -1,4 +1,4 @@
-"""What every way to a camera must do: extend `CameraContract` with a fixture ``stand``."""
+"""Tests that every camera driver must pass: extend `CameraContract` with a fixture ``stand``."""
 
 from __future__ import annotations
 
@@ -24,20 +24,20 @@ if TYPE_CHECKING:
     from acquire.camera.base import Camera, CameraOpener
 
 WAIT_S = 300.0
-"""Longest wait for lines: a limit against hanging."""
+"""Longest wait for lines, so that a test cannot hang."""
 
 
 @dataclass
 class CameraStand:
-    """A way to a camera, and its trigger.
+    """A camera under test, and its trigger.
 
     Attributes
     ----------
     opener : opens the camera
-    start, stop : the trigger's pulses; both may be called when they were already
-    serial : part of the serial number that the camera says it has
-    sent : what of the opener is pickled, where the rest is inherited by a child process; None: all of it
-    lines : (first line since it was armed, count) → the pixels that these lines must have; None: nobody knows
+    start, stop : start and stop the trigger's pulses; both may be called repeatedly
+    serial : part of the serial number that the camera reports
+    sent : the part of the opener that is pickled, if a child process inherits the rest; None: all of it
+    lines : (first line since arming, count) → the pixels that these lines must have; None: not known
     """
 
     opener: CameraOpener
@@ -49,11 +49,11 @@ class CameraStand:
 
 
 class CameraContract:
-    """Needs a fixture ``stand``, a `CameraStand`; best of scope "module", where opening takes long."""
+    """Needs a fixture ``stand``, a `CameraStand`; use scope "module" if opening takes long."""
 
     @pytest.fixture
     def camera(self, stand: CameraStand) -> Iterator[Camera]:
-        """The camera, opened; closed at the end, with its trigger stopped."""
+        """The opened camera; it is closed at the end, and its trigger stopped."""
         opened = stand.opener()
         yield opened
         opened.close()
@@ -127,13 +127,13 @@ class CameraContract:
 
 
 def take(camera: Camera, blocks: int) -> list[CameraBlock]:
-    """So many blocks, copied and released."""
-    found: list[CameraBlock] = []
+    """Return ``blocks`` blocks, which are copied and released."""
+    taken: list[CameraBlock] = []
     deadline = time.monotonic() + WAIT_S
-    while len(found) < blocks:
-        assert time.monotonic() < deadline, f"{len(found)} of {blocks} blocks came"
+    while len(taken) < blocks:
+        assert time.monotonic() < deadline, f"only {len(taken)} of {blocks} blocks came"
         block = camera.next_block(0.2)
         if block is not None:
-            found.append(CameraBlock(block.first_line, block.pixels.copy(), block.flags.copy(), block.losses))
+            taken.append(CameraBlock(block.first_line, block.pixels.copy(), block.flags.copy(), block.losses))
             camera.release(block)
-    return found
+    return taken

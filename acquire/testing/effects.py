@@ -1,4 +1,4 @@
-"""What every effect must do: extend `EffectContract` with a fixture ``effect``."""
+"""Tests that every effect must pass: extend `EffectContract` with a fixture ``effect``."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ _LED = {
 
 
 def small_bench(effects: tuple[Effect, ...] = (), **scene: Any) -> Bench:
-    """Two cameras of 8 stages and 16 bits before a blinking LED: 1 DN and 20 electrons per unit of light."""
+    """Return two 16-bit cameras of 8 stages before a blinking LED; a unit of light is 1 DN (20 electrons)."""
     table = {"kind": "leds", "leds": [_LED], "system_gain_dn_per_e": 0.05, "effects": effects}
     camera = CameraConfig(pixel_format="Mono16", black_level_dn=300.0, responsivity_dn=1.0)
     geometry = GeometryConfig(stages=STAGES, substeps=SUBSTEPS)
@@ -42,7 +42,7 @@ def small_bench(effects: tuple[Effect, ...] = (), **scene: Any) -> Bench:
 
 
 class EffectContract:
-    """Needs a fixture ``effect``: an effect, installed, whose parameters change lines that can be seen."""
+    """Needs a fixture ``effect``: an installed effect whose parameters are large enough to change lines."""
 
     def test_a_scene_file_finds_it_and_a_recording_gives_it_again(self, effect: Effect) -> None:
         assert EFFECTS.load(effect.kind) is type(effect)
@@ -58,7 +58,7 @@ class EffectContract:
             with_it, without = camera.read(600, 1024), small_bench().camera(arm, CODE).read(600, 1024)
             changed |= not np.array_equal(with_it.pixels, without.pixels)
             changed |= not np.array_equal(with_it.missing, without.missing)
-        assert changed, "neither arm has other lines with it"
+        assert changed, "the effect changes the lines of neither arm"
         assert effect.place in PLACES
 
     def test_lines_do_not_depend_on_how_they_are_read(self, effect: Effect) -> None:
@@ -77,8 +77,8 @@ class EffectContract:
         before = np.random.get_state()[1].tolist()  # type: ignore[index]  # noqa: NPY002
         first = small_bench((effect,)).camera("a", CODE).read(0, 512)
         second = small_bench((effect,)).camera("a", CODE).read(0, 512)
-        np.testing.assert_array_equal(first.pixels, second.pixels, "equal seeds, other lines")
+        np.testing.assert_array_equal(first.pixels, second.pixels, "equal seeds give different lines")
         after = np.random.get_state()[1].tolist()  # type: ignore[index]  # noqa: NPY002
-        assert before == after, "it draws from the stream of everybody: use acquire.sim.effects.base.draws"
+        assert before == after, "it draws from numpy's global stream: use acquire.sim.effects.base.draws"
         other = replace(small_bench((effect,)), realisation=1).camera("a", CODE).read(0, 512)
         assert other.pixels.shape == first.pixels.shape

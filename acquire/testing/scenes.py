@@ -1,4 +1,4 @@
-"""What every scene must do: extend `SceneContract` with a fixture ``scene``."""
+"""Tests that every scene must pass: extend `SceneContract` with a fixture ``scene``."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ if TYPE_CHECKING:
 
 SIZE, SUBSTEP_S = 24, 1e-5
 FIRST, COUNT = -7, 40
-"""A scene has no beginning: some of the sub-steps that are looked at are before the run."""
+"""A scene has no beginning, so some of the tested sub-steps are before the run."""
 
 
 class SceneContract:
-    """Needs a fixture ``scene``: a model of a scene, installed, that is not dark all the time."""
+    """Needs a fixture ``scene``: the model of an installed scene that is not always dark."""
 
     def shown(self, scene: SceneModel) -> Scene:
-        """What it shows on 24 × 24 at 100 kHz; extend this where your scene needs another size."""
+        """Return the scene on 24 × 24 pixels at 100 kHz; override this if your scene needs another size."""
         return scene.build(SIZE, SUBSTEP_S)
 
     def test_a_scene_file_finds_it_and_another_process_is_given_the_same(self, scene: SceneModel) -> None:
@@ -37,9 +37,9 @@ class SceneContract:
         assert light.shape == (COUNT, shown.size, shown.size)
         assert light.dtype == np.float32
         assert np.isfinite(light).all()
-        assert light.min() >= 0, "light below zero"
-        assert light.max() > 0, "nothing is lit"
-        assert shown.frames(3, 0).shape == (0, shown.size, shown.size), "no sub-step at all may be asked"
+        assert light.min() >= 0, "the light is negative"
+        assert light.max() > 0, "the scene is dark"
+        assert shown.frames(3, 0).shape == (0, shown.size, shown.size), "a request for 0 sub-steps is valid"
 
     def test_frames_do_not_depend_on_how_they_are_asked(self, scene: SceneModel) -> None:
         shown, again = self.shown(scene), self.shown(scene)
@@ -50,13 +50,13 @@ class SceneContract:
         np.testing.assert_array_equal(frames_at(shown, FIRST + some), whole[some])
 
     def test_masks_and_intensities_make_its_frames(self, scene: SceneModel) -> None:
-        """Of a scene without masks there is nothing to compare: it is computed frame by frame."""
+        """A scene without masks is computed frame by frame, so that there is nothing to compare."""
         shown = self.shown(scene)
         if not isinstance(shown, SeparableScene):
             return
         light, masks = shown.intensity(FIRST, COUNT), shown.masks
         assert light.shape == (len(masks), COUNT)
         assert masks.dtype == np.float32
-        made = np.einsum("kt,krc->trc", light, masks)
-        np.testing.assert_allclose(shown.frames(FIRST, COUNT), made, rtol=1e-4, atol=1e-6)
+        product = np.einsum("kt,krc->trc", light, masks)
+        np.testing.assert_allclose(shown.frames(FIRST, COUNT), product, rtol=1e-4, atol=1e-6)
         assert shown.intensity(0, 4, SUBSTEP_S / 3).shape == (len(masks), 4)  # steps of another duration

@@ -1,4 +1,4 @@
-"""What every solver must do: extend `SolverContract`; `DenoiserContract` for denoisers."""
+"""Tests that every solver must pass: extend `SolverContract`, or `DenoiserContract` for denoisers."""
 
 from __future__ import annotations
 
@@ -27,11 +27,11 @@ if TYPE_CHECKING:
 GEOMETRY = Geometry(8, 2, 80)
 SPATIAL_MERGE, TEMPORAL_MERGE = 2, 4
 NOISE_PART = 0.01
-"""Standard deviation of the lines' noise, of their mean."""
+"""Standard deviation of the lines' noise, as a fraction of their mean."""
 
 
 def blinking_segment(seed: int = 5) -> tuple[Segment, NDArray[np.float64]]:
-    """Noisy lines of two squares that blink at different rates, and the true video (t, y, x)."""
+    """Return noisy lines of two squares that blink at different rates, and the true video (t, y, x)."""
     draws = np.random.default_rng(seed)
     code = prbs(23, 77, 0, GEOMETRY.span)
     operator = DualArm(GEOMETRY, code, SPATIAL_MERGE, TEMPORAL_MERGE, np.float64)
@@ -54,10 +54,10 @@ def blinking_segment(seed: int = 5) -> tuple[Segment, NDArray[np.float64]]:
 
 
 class SolverContract:
-    """Needs ``solver``, the name of an installed solver; ``options`` are its own.
+    """Needs ``solver``, the name of an installed solver; ``options`` are passed to it.
 
-    ``most_error`` is what its video may miss of the truth on noisy lines, relative to the truth's RMS, in the
-    frames that are trusted. Without any prior about 0.6 can be had; ours reach 0.15 to 0.5.
+    ``most_error`` is the largest RMS error of its video on noisy lines, relative to the truth's RMS, over the
+    trusted frames. Without a prior about 0.6 is possible; the built-in solvers reach 0.15 to 0.5.
     """
 
     solver: ClassVar[str]
@@ -66,15 +66,15 @@ class SolverContract:
     most_error: ClassVar[float] = 0.5
 
     def solve(self, segment: Segment, **more: Any) -> Reconstruction:
-        """The segment's video, with ``iterations`` unless something else is asked."""
-        asked = {"iterations": self.iterations, "check": False} | more
+        """Reconstruct the segment, with ``iterations`` unless ``more`` overrides it."""
+        settings = {"iterations": self.iterations, "check": False} | more
         return reconstruct(
             segment,
             SPATIAL_MERGE,
             TEMPORAL_MERGE,
             solver=self.solver,
             solver_options=self.options,
-            **asked,
+            **settings,
         )
 
     def test_it_finds_what_blinks_in_noisy_lines(self) -> None:
@@ -86,8 +86,8 @@ class SolverContract:
             assert result.video.min() >= 0
         found, true = result.video[result.trusted], truth[result.trusted]
         error = float(np.linalg.norm(found - true) / np.linalg.norm(true))
-        assert error < self.most_error, f"the video misses {error:.0%} of the truth"
-        assert result.quality.misfit < 0.2, f"its lines are {result.quality.misfit:.0%} off"
+        assert error < self.most_error, f"the video has an error of {error:.0%} of the truth"
+        assert result.quality.misfit < 0.2, f"its lines have a misfit of {result.quality.misfit:.0%}"
 
     def test_masked_samples_have_no_influence_and_twice_the_light_is_twice_the_video(self) -> None:
         segment, _ = blinking_segment()
@@ -103,24 +103,24 @@ class SolverContract:
 
     def test_a_stop_ends_it_with_the_best_so_far_and_every_iteration_is_told(self) -> None:
         segment, _ = blinking_segment()
-        stop, told = threading.Event(), []
+        stop, reported = threading.Event(), []
 
         def progress(step: Any) -> None:
-            told.append(step.iteration)
+            reported.append(step.iteration)
             stop.set()
 
         result = self.solve(segment, iterations=10_000, progress=progress, stop=stop)
         assert result.ended == "stopped"
-        assert len(told) == result.iterations < 1000, "iterations go on after a stop: count them by its clock"
+        assert len(reported) == result.iterations < 1000, "it continues after a stop: iterate with its clock"
         assert np.isfinite(result.video).all()
 
 
 class DenoiserContract(ABC):
-    """Needs ``make``, what gives the denoiser."""
+    """Needs ``make``, which returns the denoiser."""
 
     @abstractmethod
     def make(self) -> Denoiser:
-        """The denoiser to be tried."""
+        """Return the denoiser under test."""
 
     def test_no_strength_changes_nothing_and_more_leaves_less_noise(self) -> None:
         draws = np.random.default_rng(2)
@@ -132,8 +132,8 @@ class DenoiserContract(ABC):
         assert cleaned.shape == noisy.shape
         assert cleaned.dtype == noisy.dtype
         left = float(np.std(cleaned - flat) / np.std(noisy - flat))
-        assert left < 0.8, f"a strength as large as the noise leaves {left:.0%} of it"
-        np.testing.assert_array_equal(noisy, kept, "it wrote into the frames that it was given")
+        assert left < 0.8, f"a strength equal to the noise leaves {left:.0%} of it"
+        np.testing.assert_array_equal(noisy, kept, "it wrote into its input frames")
 
     def test_one_strength_per_frame_is_possible(self) -> None:
         frames = np.random.default_rng(3).standard_normal((2, 8, 8)).astype(np.float32)

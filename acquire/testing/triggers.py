@@ -1,4 +1,4 @@
-"""What every sync trigger must do: extend `TriggerContract` with a fixture ``trigger``."""
+"""Tests that every sync trigger must pass: extend `TriggerContract` with a fixture ``trigger``."""
 
 from __future__ import annotations
 
@@ -16,23 +16,23 @@ if TYPE_CHECKING:
     from acquire.trigger.base import Trigger
 
 WAIT_S = 300.0
-"""Longest wait for tags: a limit against hanging."""
+"""Longest wait for tags, so that a test cannot hang."""
 CODE = PrbsCode(64, mix_seed(3, 64))
 SUBSTEPS, SUBSTEP_TICKS, TAG_EVERY = 3, 900, 16
 
 
 class TriggerContract:
-    """Needs a fixture ``trigger``: a `Trigger` that no run has used, closed at the fixture's end."""
+    """Needs a fixture ``trigger``: a `Trigger` without a run so far, which the fixture closes at its end."""
 
     def run(self, run_id: str = "run", **changes: Any) -> TriggerRun:
-        """What a run asks; extend this where your trigger wants other sub-steps."""
-        asked: dict[str, Any] = {
+        """Return the run to prepare; override this if your trigger needs other sub-steps."""
+        settings: dict[str, Any] = {
             "code": CODE,
             "substeps": SUBSTEPS,
             "substep_ticks": SUBSTEP_TICKS,
             "tag_every_lines": TAG_EVERY,
         }
-        return TriggerRun(run_id, **(asked | changes))
+        return TriggerRun(run_id, **(settings | changes))
 
     def test_it_says_who_it_is(self, trigger: Trigger) -> None:
         identity = trigger.identify()
@@ -49,11 +49,11 @@ class TriggerContract:
         assert early_ns <= fit.utc_ns_at_tick_0 <= time.time_ns() + fit.uncertainty_ns
         tags = collect(trigger, 10 * run.tag_every_lines)
         lines = trigger.stop()
-        assert trigger.stop() == lines, "stopping twice is stopping once"
+        assert trigger.stop() == lines, "a second stop must have no effect"
         tags += trigger.tags(0.1)
         assert [tag.line for tag in tags] == list(range(0, lines, run.tag_every_lines))
         assert all(tag.code_index == run.substeps * tag.line for tag in tags)
-        assert all(tag.tick == run.line_period_ticks * tag.line for tag in tags), "jitter"
+        assert all(tag.tick == run.line_period_ticks * tag.line for tag in tags), "the line period jitters"
         statistics = trigger.statistics()
         assert statistics["pulses"] == lines
         assert statistics["tags"] >= len(tags)
@@ -82,7 +82,9 @@ class TriggerContract:
     def test_what_cannot_be_is_refused_in_words_before_a_pulse(self, trigger: Trigger) -> None:
         with pytest.raises(TriggerError) as refused:
             trigger.prepare(self.run(substep_ticks=0))
-        assert refused.value.possible or refused.value.hint, "the error says neither what can be had nor why"
+        assert refused.value.possible or refused.value.hint, (
+            "the error states neither what is possible nor why"
+        )
 
     def test_stop_ends_a_wait_for_tags(self, trigger: Trigger) -> None:
         trigger.prepare(self.run(tag_every_lines=60_000))
@@ -98,7 +100,7 @@ class TriggerContract:
         waiter.start()
         trigger.stop()
         waiter.join(WAIT_S)
-        assert waited, "a wait for tags outlives its run"
+        assert waited, "a wait for tags must end with its run"
 
     def test_closing_twice_is_closing_once(self, trigger: Trigger) -> None:
         trigger.identify()
@@ -107,10 +109,10 @@ class TriggerContract:
 
 
 def collect(trigger: Trigger, lines: int) -> list[LineTag]:
-    """Tags until one of line ``lines`` or later has come."""
+    """Return the tags up to the first of line ``lines`` or later."""
     tags: list[LineTag] = []
     deadline = time.monotonic() + WAIT_S
     while not tags or tags[-1].line < lines:
-        assert time.monotonic() < deadline, f"{len(tags)} tags"
+        assert time.monotonic() < deadline, f"only {len(tags)} tags came"
         tags += trigger.tags(0.5)
     return tags

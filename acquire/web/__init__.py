@@ -1,4 +1,4 @@
-"""The operator's page: a process of its own, an observer that nobody waits for.
+"""The operator's page: a separate process that only observes, and that nothing waits for.
 
 ::
 
@@ -7,6 +7,7 @@
       └ rings, read-only ═══▶ Live (a thread) ─▶ pictures ─────┘
     recordings' directory ══▶ Archive, Jobs (queue of one) ───────▶ requests
 
-Its defects cannot cost a line: it maps the rings read-only, its commands go to the daemon as anybody's do,
-and a browser that does not read is disconnected. Killed, it leaves nothing; the daemon starts it anew.
+Its defects cannot cost a line: it maps the rings read-only, sends its commands to the daemon as any client
+does, and disconnects a browser that does not read. It leaves nothing behind when killed, and the daemon
+restarts it.
 """

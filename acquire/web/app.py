@@ -45,12 +45,15 @@ if TYPE_CHECKING:
 
 STATIC = Path(__file__).parent / "static"
 MOST_READING = 32
-"""Requests that wait for the thread that reads."""
+"""Largest number of requests that wait for the reading thread."""
 WHY_REFUSED: dict[int | str, dict[str, Any]] = {
     401: {"model": ErrorMessage, "description": "the token is missing or wrong"},
-    403: {"model": ErrorMessage, "description": "the token is for looking only, or the page is not ours"},
-    421: {"model": ErrorMessage, "description": "asked for by a name that is not ours"},
-    429: {"model": ErrorMessage, "description": "too many requests, or wrong tokens"},
+    403: {
+        "model": ErrorMessage,
+        "description": "the token is a viewer's, or the request comes from another site",
+    },
+    421: {"model": ErrorMessage, "description": "the host name is not one of the page's"},
+    429: {"model": ErrorMessage, "description": "too many requests, or too many wrong tokens"},
 }
 PNG: dict[int | str, dict[str, Any]] = {
     200: {"description": "PNG", "content": {"image/png": {"schema": {"type": "string", "format": "binary"}}}}
@@ -67,7 +70,7 @@ T = TypeVar("T")
 
 
 class Reading:
-    """One thread for whatever waits for the disk, and so many that wait for it."""
+    """One thread for all work that waits for the disk, with a limited number of waiting requests."""
 
     def __init__(self) -> None:
         self._thread = ThreadPoolExecutor(1, thread_name_prefix="reading")
@@ -75,7 +78,7 @@ class Reading:
 
     async def __call__(self, work: Callable[[], T]) -> T:
         if self._waiting >= MOST_READING:
-            raise UsageError("too much is being read already", hint="again in a moment")
+            raise UsageError("too many requests are reading already", hint="try again in a moment")
         self._waiting += 1
         try:
             return await asyncio.get_running_loop().run_in_executor(self._thread, work)
@@ -86,17 +89,29 @@ class Reading:
 def build_page(
     socket: Path, directory: Path, tokens: Tokens, names: frozenset[str], *, secure: bool
 ) -> Guard:
-    """The application of the page for the daemon on ``socket``, whose recordings lie in ``directory``.
+    """Return the page's application for the daemon on ``socket``, whose recordings are in ``directory``.
 
-    Must be called while the event loop runs that serves it. ``secure``: by https only.
+    Must be called from within the event loop that will serve it. ``secure``: only over https.
     """
     hub = Hub(socket, Live)
     archive, reading = Archive(directory), Reading()
     jobs = Jobs(directory, archive, socket)
+
+    @asynccontextmanager
+    async def lifespan(_: FastAPI) -> AsyncIterator[None]:
+        tasks = [asyncio.create_task(each) for each in (hub.run(), jobs.run(), hub.glimpser.run())]
+        try:
+            yield
+        finally:
+            for task in tasks:
+                task.cancel()
+            # They must finish: a running job ends its process when it is cancelled.
+            await asyncio.gather(*tasks, return_exceptions=True)
+
     app = new_app(
         "The instrument's page: the daemon's API, recordings, videos and jobs.",
         openapi_url="/api/openapi.json",
-        lifespan=_life(hub, jobs),
+        lifespan=lifespan,
     )
     api = APIRouter(prefix="/api", responses=WHY_REFUSED)
     api.include_router(routes(Passing(hub), Answers()))
@@ -107,45 +122,37 @@ def build_page(
     guard = Guard(app, tokens, names)
     _add_session(api, guard, tokens, secure=secure)
     app.include_router(api)
-    _add_files(app)
+
+    @app.get("/", include_in_schema=False)
+    async def index() -> FileResponse:
+        return FileResponse(STATIC / "index.html", headers={"Cache-Control": "no-cache"})
+
+    app.mount("/static", StaticFiles(directory=STATIC), name="static")
     return guard
 
 
-def _life(hub: Hub, jobs: Jobs) -> Any:
-    @asynccontextmanager
-    async def life(_: FastAPI) -> AsyncIterator[None]:
-        tasks = [asyncio.create_task(one) for one in (hub.run(), jobs.run(), hub.glimpser.run())]
-        try:
-            yield
-        finally:
-            for task in tasks:
-                task.cancel()
-            # Waited for: a job under way ends its process in its own end.
-            await asyncio.gather(*tasks, return_exceptions=True)
-
-    return life
-
-
 def _add_session(api: APIRouter, guard: Guard, tokens: Tokens, *, secure: bool) -> None:
-    @api.post("/session", summary="A token for a cookie")
+    @api.post("/session", summary="Exchange a token for a cookie")
     async def enter(request: Request, asked: SessionRequest, response: Response) -> Session:
         address = request.client.host if request.client else ""
         role = guard.role_of_token(asked.token, address)
         if role is None:
-            raise UsageError("the token is wrong, or too many wrong ones came", hint="acquire web --link")
-        # No script can read it, no other site can have it sent, and it is good below /api alone.
+            raise UsageError(
+                "the token is wrong, or this address has sent too many wrong ones", hint="acquire web --link"
+            )
+        # No script can read the cookie, no other site can make a browser send it, and only /api receives it.
         response.set_cookie(
             COOKIE, tokens.cookie(role), httponly=True, samesite="strict", secure=secure, path="/api"
         )
-        log.info("%s enters from %s", role, address)
+        log.info("%s logged in from %s", role, address)
         return Session(role=role)
 
-    @api.delete("/session", summary="Leave")
+    @api.delete("/session", summary="Log out")
     async def leave(response: Response) -> dict[str, bool]:
         response.delete_cookie(COOKIE, path="/api")
         return {"left": True}
 
-    @api.get("/whoami", summary="Who is asking")
+    @api.get("/whoami", summary="Role of the caller")
     async def who(request: Request) -> Session:
         role = guard.role_of(request)
         assert role is not None
@@ -162,11 +169,9 @@ def _add_stream(api: APIRouter, pages: Pages) -> None:
     async def live(
         pictures: Annotated[bool, Query()] = True,
         glimpses: Annotated[
-            bool, Query(description="coarse videos of what has just passed; takes a core")
+            bool, Query(description="coarse videos of the latest lines; uses one core")
         ] = False,
-        once: Annotated[
-            bool, Query(description="the state and no more, as a hidden page asks for it")
-        ] = False,
+        once: Annotated[bool, Query(description="only the current state, once, for a hidden page")] = False,
     ) -> Response:
         if once:
             return Response(pages.state, media_type="application/octet-stream", headers=NO_STORE)
@@ -175,17 +180,17 @@ def _add_stream(api: APIRouter, pages: Pages) -> None:
 
 
 def _add_recordings(api: APIRouter, archive: Archive, reading: Reading) -> None:
-    @api.get("/recordings", summary="Recordings, the newest first")
+    @api.get("/recordings", summary="Recordings, newest first")
     async def recordings() -> list[RecordingFacts]:
         return await reading(archive.recordings)
 
-    @api.get("/recordings/{name}", summary="A recording, with events, gaps and holds")
+    @api.get("/recordings/{name}", summary="A recording, with its events, gaps and holds")
     async def recording(name: str) -> RecordingDetail:
         return await reading(lambda: archive.recording(name))
 
     @api.get(
         "/recordings/{name}/picture",
-        summary="Both arms over the whole length",
+        summary="Picture of both arms over the whole recording",
         responses=PNG,
         response_class=Response,
     )
@@ -193,22 +198,22 @@ def _add_recordings(api: APIRouter, archive: Archive, reading: Reading) -> None:
         content = await reading(lambda: archive.picture(name))
         return Response(content, media_type="image/png", headers=NO_STORE)
 
-    @api.post("/recordings/{name}/hold", summary="Keep lines from being deleted by retention")
+    @api.post("/recordings/{name}/hold", summary="Protect lines from retention")
     async def hold(name: str, asked: HoldRequest) -> RecordingDetail:
         await reading(lambda: archive.hold(name, asked))
         return await reading(lambda: archive.recording(name))
 
-    @api.get("/videos", summary="Reconstructed videos, the newest first")
+    @api.get("/videos", summary="Reconstructed videos, newest first")
     async def videos() -> list[VideoFacts]:
         return await reading(archive.videos)
 
-    @api.get("/videos/{name}", summary="A video, with the range that it is shown in")
+    @api.get("/videos/{name}", summary="A video, with its display range")
     async def video(name: str) -> VideoFacts:
         return await reading(lambda: archive.video(name))
 
     @api.get(
         "/videos/{name}/frames",
-        summary="Frames, 8 bits a pixel, one after the other",
+        summary="Consecutive frames, 8 bits per pixel",
         responses=BYTES,
         response_class=Response,
     )
@@ -218,40 +223,32 @@ def _add_recordings(api: APIRouter, archive: Archive, reading: Reading) -> None:
         content = await reading(lambda: archive.frames(name, first, count))
         return Response(content, media_type="application/octet-stream", headers=NO_STORE)
 
-    @api.get("/cuts/{name}", summary="A stretch that was cut", responses=BYTES, response_class=Response)
+    @api.get("/cuts/{name}", summary="A range that was cut", responses=BYTES, response_class=Response)
     async def cut(name: str) -> FileResponse:
         path = await reading(lambda: archive.path_of(name, ".npz"))
         return FileResponse(path, media_type="application/octet-stream", filename=name)
 
 
 def _add_jobs(api: APIRouter, jobs: Jobs) -> None:
-    @api.get("/jobs", summary="Jobs, the newest first")
+    @api.get("/jobs", summary="Jobs, newest first")
     async def list_jobs() -> list[JobFacts]:
         return jobs.list()
 
-    @api.post("/jobs", summary="Reconstruct, preview or cut a stretch of a recording")
+    @api.post("/jobs", summary="Reconstruct, preview or cut a range of a recording")
     async def add(asked: JobRequest) -> JobFacts:
         return jobs.add(asked)
 
-    @api.delete("/jobs/{number}", summary="End a job")
+    @api.delete("/jobs/{number}", summary="Stop a job")
     async def stop(number: int) -> JobFacts:
         return await jobs.stop(number)
 
 
 def _add_calibration(api: APIRouter, hub: Hub, jobs: Jobs, directory: Path, reading: Reading) -> None:
-    @api.get("/calibration", summary="The calibration: its steps, and what they found")
+    @api.get("/calibration", summary="The calibration: its steps and their findings")
     async def calibration() -> CalibrationFacts:
         place, named = place_of(directory, hub.setup)
         return await reading(lambda: calibration_facts(place, named=named))
 
-    @api.post("/calibration", summary="Carry out a step of the calibration, as a job")
+    @api.post("/calibration", summary="Carry out a calibration step, as a job")
     async def calibrate(asked: CalibrationRequest) -> JobFacts:
         return jobs.calibrate(asked, place_of(directory, hub.setup)[0])
-
-
-def _add_files(app: FastAPI) -> None:
-    @app.get("/", include_in_schema=False)
-    async def index() -> FileResponse:
-        return FileResponse(STATIC / "index.html", headers={"Cache-Control": "no-cache"})
-
-    app.mount("/static", StaticFiles(directory=STATIC), name="static")

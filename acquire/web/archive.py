@@ -1,7 +1,7 @@
-"""Recordings and videos of one directory, for a page: facts, pictures, frames. By name, never by path.
+"""Recordings and videos of one directory, for the page: facts, pictures and frames, by name and not by path.
 
-A name is an entry of the directory itself that is a directory, or a file, and no link: nothing outside it can
-be reached. One thread of its own reads, so that a slow disk keeps nothing else waiting.
+A name must be an entry of the directory itself, and not a link, so that nothing outside can be reached. A
+dedicated thread reads, so that a slow disk keeps nothing else waiting.
 """
 
 from __future__ import annotations
@@ -37,16 +37,16 @@ if TYPE_CHECKING:
     from acquire.store import VideoFile
 
 MOST_LISTED = 500
-"""Recordings in a list: the newest."""
+"""Largest number of entries in a list; the newest are listed."""
 MOST_EVENTS = 1000
 MOST_PICTURES = 64
 PICTURE_ROWS, PICTURE_COLUMNS = 96, 128
-"""Of one arm, in a recording's picture."""
-STRETCH_LINES = 8
-"""Looked at for one row."""
+"""Size of one arm's part of a recording's picture."""
+LINES_PER_ROW = 8
+"""Lines sampled for one row of the picture."""
 MOST_FRAME_BYTES = 4 * 2**20
 SAMPLED_FRAMES = 24
-"""By which a video's range is found."""
+"""Number of frames from which a video's display range is computed."""
 VIDEO = "acquire-video/"
 LOST_COLOUR = (200, 0, 140)
 
@@ -61,12 +61,12 @@ class Archive:
         self._ranges: OrderedDict[str, tuple[float, float]] = OrderedDict()
 
     def path_of(self, name: str, suffix: str = ".zarr") -> Path:
-        """Raises PlaceError for what is no entry of the directory, or a link."""
-        # By `lstat`: a link would lead out of the directory.
+        """Return the path of an entry. Raises PlaceError if it is not in the directory, or is a link."""
+        # lstat, because a link could lead out of the directory.
         path = self._directory / name
-        odd = not name.endswith(suffix) or "\0" in name or name in (".", "..") or Path(name).name != name
+        invalid = not name.endswith(suffix) or "\0" in name or name in (".", "..") or Path(name).name != name
         try:
-            mode = None if odd else path.lstat().st_mode
+            mode = None if invalid else path.lstat().st_mode
         except OSError:
             mode = None
         kind = stat.S_ISDIR if suffix == ".zarr" else stat.S_ISREG
@@ -77,22 +77,22 @@ class Archive:
         return path
 
     def recordings(self) -> list[RecordingFacts]:
-        """The newest first."""
+        """Return the recordings, newest first."""
         return [self._known_facts(path) for path in self._entries(video=False)]
 
     def recording(self, name: str) -> RecordingDetail:
-        """Raises PlaceError and DataError."""
+        """Return a recording with its events, gaps and holds. Raises PlaceError and DataError."""
         path = self.path_of(name)
         opened = open_recording(path)
         return RecordingDetail(
             **_facts(path, opened).model_dump(),
             event_list=[
-                EventFacts(kind=one.kind, line=one.line, text=one.text)
-                for one in opened.events[-MOST_EVENTS:]
+                EventFacts(kind=event.kind, line=event.line, text=event.text)
+                for event in opened.events[-MOST_EVENTS:]
             ],
             gap_list=[
-                GapFacts(arm=one.arm, first_line=one.first_line, count=one.count, cause=one.cause)
-                for one in opened.gaps[-MOST_EVENTS:]
+                GapFacts(arm=gap.arm, first_line=gap.first_line, count=gap.count, cause=gap.cause)
+                for gap in opened.gaps[-MOST_EVENTS:]
             ],
             hold_list=[
                 HoldFacts(first_line=int(first), count=int(count), why=str(why[0]) if why else "")
@@ -104,33 +104,39 @@ class Archive:
         hold(self.path_of(name), request.first_line, request.lines, request.why)
 
     def picture(self, name: str) -> bytes:
-        """Both arms, time downwards, as PNG. Raises PlaceError and DataError."""
+        """Return a PNG of both arms, with time downwards. Raises PlaceError and DataError."""
         path = self.path_of(name)
         opened = open_recording(path)
         key = (name, opened.state, opened.lines, opened.attrs.get("run_id"))
         if key not in self._pictures:
             parts = [_arm_overview(opened, arm) for arm in ARMS]
-            between = np.full((parts[0].shape[0], 4, 3), 128, np.uint8)
+            separator = np.full((parts[0].shape[0], 4, 3), 128, np.uint8)
             file = BytesIO()
-            Image.fromarray(np.concatenate([parts[0], between, parts[1]], axis=1)).save(file, "PNG")
+            Image.fromarray(np.concatenate([parts[0], separator, parts[1]], axis=1)).save(file, "PNG")
             _remember(self._pictures, key, file.getvalue(), MOST_PICTURES)
         return self._pictures[key]
 
     def videos(self) -> list[VideoFacts]:
-        """The newest first."""
-        return [self._video_facts(path) for path in self._entries(video=True)]
+        """Return the videos, newest first."""
+        listed = []
+        for path in self._entries(video=True):
+            try:
+                listed.append(_video_facts(path.name, open_video(path)))
+            except AcquireError as error:
+                listed.append(VideoFacts(name=path.name, error=shortened(error.message, 300)))
+        return listed
 
     def video(self, name: str) -> VideoFacts:
-        """With the range that it is shown in. Raises PlaceError and DataError."""
+        """Return a video with its display range. Raises PlaceError and DataError."""
         path = self.path_of(name)
         video = open_video(path)
         if name not in self._ranges:
-            _remember(self._ranges, name, _range(video), MOST_PICTURES)
+            _remember(self._ranges, name, _display_range(video), MOST_PICTURES)
         low, high = self._ranges[name]
-        return _of_video(name, video).model_copy(update={"low": low, "high": high})
+        return _video_facts(name, video).model_copy(update={"low": low, "high": high})
 
     def frames(self, name: str, first: int, count: int) -> bytes:
-        """Frames of 8 bits one after the other: as many as there are, and fit into an answer."""
+        """Return consecutive 8-bit frames, as many as exist and fit into one answer."""
         facts, video = self.video(name), open_video(self.path_of(name))
         most = max(1, MOST_FRAME_BYTES // (facts.rows * facts.columns))
         if not 0 <= first < facts.frames:
@@ -141,6 +147,7 @@ class Archive:
         return content
 
     def _entries(self, *, video: bool) -> list[Path]:
+        """Return the directory's videos or recordings, newest first."""
         found = []
         try:
             entries = list(self._directory.iterdir())
@@ -156,6 +163,7 @@ class Archive:
         return [path for _, path in sorted(found, reverse=True)[:MOST_LISTED]]
 
     def _known_facts(self, path: Path) -> RecordingFacts:
+        """Return a recording's facts, from the cache if it is sealed and unchanged."""
         try:
             changed = (path / "zarr.json").stat().st_mtime_ns
         except OSError:
@@ -168,15 +176,10 @@ class Archive:
                 return RecordingFacts(name=path.name, error=shortened(error.message, 300))
             except (*DAMAGE, MemoryError) as error:
                 return RecordingFacts(name=path.name, error=f"cannot be read: {shortened(error, 300)}")
-            if known.state == "sealed":  # another one changes between two looks, and more often than its root
+            # A recording that is being written changes more often than its root document does.
+            if known.state == "sealed":
                 _remember(self._facts, key, known, 2 * MOST_LISTED)
         return known
-
-    def _video_facts(self, path: Path) -> VideoFacts:
-        try:
-            return _of_video(path.name, open_video(path))
-        except AcquireError as error:
-            return VideoFacts(name=path.name, error=shortened(error.message, 300))
 
 
 def _remember(cache: OrderedDict[Any, Any], key: Any, value: Any, most: int) -> None:
@@ -189,7 +192,7 @@ def _is_video(path: Path) -> bool:
     try:
         return (format_of(path) or "").startswith(VIDEO)
     except AcquireError:
-        return False  # listed among the recordings, with what is wrong with it
+        return False  # it is then listed among the recordings, with the error
 
 
 def _facts(path: Path, opened: Recording) -> RecordingFacts:
@@ -217,6 +220,7 @@ def _facts(path: Path, opened: Recording) -> RecordingFacts:
 
 
 def _arm_overview(opened: Recording, arm: str) -> NDArray[np.uint8]:
+    """Return the brightest values of one arm over the whole recording: (row, column, RGB)."""
     stream, white = opened.camera(arm), float(opened.attrs["cameras"][arm]["white_dn"])
     rows = min(PICTURE_ROWS, max(1, opened.lines))
     columns = min(PICTURE_COLUMNS, stream.pixels)
@@ -225,7 +229,7 @@ def _arm_overview(opened: Recording, arm: str) -> NDArray[np.uint8]:
     kept = opened.kept_rows()
     for row in range(rows if opened.lines else 0):
         start = row * opened.lines // rows
-        stop = min(opened.lines, start + STRETCH_LINES)
+        stop = min(opened.lines, start + LINES_PER_ROW)
         if not any(start in rows for rows in kept):
             picture[row] = LOST_COLOUR
             continue
@@ -239,7 +243,7 @@ def _arm_overview(opened: Recording, arm: str) -> NDArray[np.uint8]:
     return picture[: max(rows, 1)]
 
 
-def _of_video(name: str, video: VideoFile) -> VideoFacts:
+def _video_facts(name: str, video: VideoFile) -> VideoFacts:
     frames, rows, columns = video.video.shape
     return VideoFacts(
         name=name,
@@ -252,8 +256,8 @@ def _of_video(name: str, video: VideoFile) -> VideoFacts:
     )
 
 
-def _range(video: VideoFile) -> tuple[float, float]:
-    """Of frames over the whole length, but for the darkest and brightest of a thousand pixels."""
+def _display_range(video: VideoFile) -> tuple[float, float]:
+    """Return the values shown black and white: the 0.1 % and 99.9 % quantiles of frames over its length."""
     frames = video.video.shape[0]
     step = max(1, frames // SAMPLED_FRAMES)
     values = np.stack([np.asarray(video.video[k], np.float32) for k in range(0, frames, step)])

@@ -1,4 +1,4 @@
-"""The calibration that the page's steps add to: where it is, what is to be done, what was found."""
+"""The calibration that the page's steps extend: its path, its steps and their findings."""
 
 from __future__ import annotations
 
@@ -15,40 +15,50 @@ if TYPE_CHECKING:
     from acquire.daemon.facts import Setup
 
 RECORDINGS = "calibration-recordings"
-"""Directory of what the steps record, below that of the recordings, as the command's is below where it is."""
+"""Directory of the steps' recordings, below that of the other recordings."""
 UNNAMED = "calibration.zarr"
-"""In that directory, where the rig names no calibration."""
+"""Name of the calibration in that directory if the rig names none."""
 
 
 def place_of(directory: Path, setup: Setup | None) -> tuple[Path, bool]:
-    """Where the calibration is kept, and whether that is the one that the rig names.
+    """Return the path of the calibration, and whether the rig names it.
 
-    Raises NoDaemonError where that is not known yet.
+    Raises NoDaemonError if the rig is not known yet.
     """
     if setup is None:
-        raise NoDaemonError("the daemon has not said yet what its rig is", hint="again in a moment")
+        raise NoDaemonError("the daemon has not reported its rig yet", hint="try again in a moment")
     named = setup.config.get("calibration")
     return (Path(str(named)), True) if named else (directory / RECORDINGS / UNNAMED, False)
 
 
 def calibration_facts(place: Path, *, named: bool) -> CalibrationFacts:
-    """For one thread that may wait for the disk. What cannot be read is told, and the steps all the same."""
-    known, error = None, None
+    """Return the steps and their findings. Blocks on the disk.
+
+    If the calibration cannot be read, the error is returned with steps that have no findings.
+    """
+    from acquire.calibrate.file import open_calibration  # imports large libraries, so only on demand
+
+    error = None
     try:
-        known = _open(place)
+        try:
+            known = open_calibration(place)
+        except PlaceError:
+            if place.exists():
+                raise
+            known = None  # no step has been carried out yet
         steps = [_step(step, known) for step in STEPS]
-    except AcquireError as trouble:
-        error = shortened(trouble.message, 300)
+    except AcquireError as problem:
+        error = shortened(problem.message, 300)
         steps = [_step(step, None) for step in STEPS]
     return CalibrationFacts(path=str(place), named=named, error=error, steps=steps)
 
 
 def step_of(request: CalibrationRequest) -> Step:
-    """Raises UsageError for a step that there is not, or too few lines of it."""
-    step = next((one for one in STEPS if one.name == request.step), None)
+    """Return the step that a request names. Raises UsageError if there is none, or for too few lines."""
+    step = next((each for each in STEPS if each.name == request.step), None)
     if step is None:
         raise UsageError(
-            f"the step {request.step!r} is not known", possible=", ".join(one.name for one in STEPS)
+            f"there is no step {request.step!r}", possible=", ".join(each.name for each in STEPS)
         )
     if request.lines is not None and request.lines < step.least_lines:
         raise UsageError(
@@ -58,20 +68,10 @@ def step_of(request: CalibrationRequest) -> Step:
     return step
 
 
-def _open(place: Path) -> Calibration | None:
-    from acquire.calibrate.file import open_calibration  # its libraries: when somebody asks
-
-    try:
-        return open_calibration(place)
-    except PlaceError:
-        if place.exists():
-            raise
-        return None
-
-
 def _step(step: Step, known: Calibration | None) -> StepFacts:
     found = []
-    if known is not None and step.finds[0] in known.steps:  # others may be known by another step, too
+    # The first finding is the step's own; the others may come from another step, too.
+    if known is not None and step.finds[0] in known.steps:
         found = [_finding(known, name) for name in step.finds if name in known.steps]
     return StepFacts(
         name=step.name,

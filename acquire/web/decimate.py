@@ -1,8 +1,8 @@
-"""Lines of one arm as few rows of 8 bits: the darkest and the brightest of what a row stands for.
+"""Decimate the lines of one arm to a few 8-bit rows with the darkest and brightest values of their lines.
 
-Row ``r`` is lines ``r·step`` to ``r·step + step − 1`` by the trigger's number, so that the rows of both arms
-belong together, whatever blocks they came in. Of many lines only some are looked at: a picture, not a record;
-what is counted (lost, saturated) comes from the capture path, which sees every line.
+Row ``r`` covers lines ``r·step`` to ``r·step + step − 1`` by the trigger's count, so that the rows of both
+arms correspond, whatever blocks they came in. At high rates only some of the lines are sampled, since this is
+a picture and not a record; counts of lost or saturated lines come from the capture path, which sees them all.
 """
 
 from __future__ import annotations
@@ -18,20 +18,20 @@ if TYPE_CHECKING:
 MOST_ROWS_PER_S = 1000
 MOST_COLUMNS = 512
 BYTES_PER_S = 4e6
-"""Of pixels that are looked at, per arm."""
+"""Rate of sampled pixels, per arm."""
 MOST_SAMPLES = 16
-"""Lines that are looked at for one row."""
+"""Largest number of lines sampled for one row."""
 MOST_UNSEEN_ROWS = 512
-"""Rows that are shown as unseen at most; a longer pause is shortened."""
+"""Largest number of consecutive rows shown as unseen; a longer pause is shortened."""
 BINS = 64
-"""Of the histogram, over the range of the camera."""
+"""Bins of the histogram, over the range of the camera."""
 SEEN, LOST, UNSEEN = 0, 1, 2
-"""What a row is: seen; some of its lines were lost; they passed while nobody looked."""
+"""Kinds of rows: seen; some lines were lost; the lines passed while no page was watching."""
 
 
 @dataclass(frozen=True, slots=True)
 class Scale:
-    """How lines become rows. ``step`` lines per row, one of ``stride`` looked at; ``white_dn`` is 255."""
+    """``step`` lines per row, of which one in ``stride`` is sampled; ``white_dn`` becomes 255."""
 
     step: int
     stride: int
@@ -47,7 +47,7 @@ class Scale:
 
 @dataclass(slots=True, eq=False)
 class Rows:
-    """Rows that are complete: ``kind`` (row), ``low``, ``high`` (row, column), 8 bit, from ``first`` on."""
+    """Complete rows from ``first`` on: ``kind`` (row,), and ``low`` and ``high`` (row, column) in 8 bits."""
 
     first: int
     kind: NDArray[np.uint8]
@@ -55,12 +55,12 @@ class Rows:
     high: NDArray[np.uint8]
     histogram: NDArray[np.int64]
     saturated: int
-    """Pixels at the camera's white, of those in the histogram."""
+    """Number of pixels in the histogram that are at the camera's white level."""
 
 
 @dataclass(slots=True)
 class _Row:
-    """The row under way."""
+    """The row that is being filled."""
 
     number: int
     low: NDArray[Any] | None = None
@@ -77,7 +77,7 @@ class _Done:
 
 
 class Decimator:
-    """Of one arm and one run. Lines go in block by block; `take` gives the rows that are complete."""
+    """Decimates one arm during one run. `add` takes lines block by block; `take` returns complete rows."""
 
     def __init__(self, scale: Scale, width: int) -> None:
         self._scale = scale
@@ -96,7 +96,7 @@ class Decimator:
         return len(self._edges)
 
     def sampled_lines(self, first_line: int, count: int) -> NDArray[np.int64]:
-        """Those of a block's lines that are to be looked at, by their numbers."""
+        """Return the numbers of a block's lines that are to be sampled."""
         stride = self._scale.stride
         start = max(first_line, self._next_line or first_line)
         return np.arange(start + -start % stride, first_line + count, stride)
@@ -104,25 +104,25 @@ class Decimator:
     def add(
         self, first_line: int, count: int, lines: NDArray[np.int64], pixels: NDArray[Any], *, lost: bool
     ) -> None:
-        """A block of ``count`` lines, of which ``pixels`` (line, pixel) are the sampled ``lines``.
+        """Add a block of ``count`` lines; ``pixels`` (line, pixel) are those of the sampled ``lines``.
 
-        ``lost``: lines just before it were lost, not merely unseen.
+        ``lost``: the lines just before it were lost, and not merely unseen.
         """
         if self._next_line is not None and first_line > self._next_line:
             self._reduce()
-            self._pass_over(first_line, LOST if lost else UNSEEN)
+            self._skip_to(first_line, LOST if lost else UNSEEN)
         self._next_line = max(first_line + count, self._next_line or 0)
         if len(lines):
             self._waiting.append((lines, pixels))
 
     def take(self) -> Rows | None:
-        """The rows that were completed since the last call."""
+        """Return the rows completed since the last call."""
         self._reduce()
         done, self._done = self._done, _Done()
         if not done.kinds:
             return None
         black = np.zeros(self.columns, np.uint8)
-        found = Rows(
+        rows = Rows(
             first=done.first,
             kind=np.array(done.kinds, np.uint8),
             low=np.stack([black if row is None else self._eight_bits(row) for row in done.lows]),
@@ -131,16 +131,16 @@ class Decimator:
             saturated=self._saturated,
         )
         self._histogram, self._saturated = np.zeros(BINS, np.int64), 0
-        return found
+        return rows
 
     def _reduce(self) -> None:
-        """What waits, many blocks at once, becomes rows."""
+        """Turn the waiting blocks into rows, many blocks at a time."""
         if not self._waiting:
             return
         lines = np.concatenate([lines for lines, _ in self._waiting])
         sampled = np.concatenate([pixels for _, pixels in self._waiting])
         self._waiting.clear()
-        # By value first, and then by bin: there are few values, and many pixels.
+        # First by value and then by bin, because there are few values and many pixels.
         white = self._scale.white_dn
         values = np.bincount(sampled.ravel(), minlength=white + 1)[: white + 1]
         self._histogram += np.bincount(self._bins, values, BINS).astype(np.int64)
@@ -150,19 +150,19 @@ class Decimator:
             low = np.minimum.reduceat(sampled, self._edges, axis=1)
             high = np.maximum.reduceat(sampled, self._edges, axis=1)
         rows = lines // self._scale.step
-        at = np.flatnonzero(np.diff(rows, prepend=rows[0] - 1))
-        lows, highs = np.minimum.reduceat(low, at, axis=0), np.maximum.reduceat(high, at, axis=0)
-        for number, one_low, one_high in zip(rows[at], lows, highs, strict=True):
-            row = self._begin(int(number))  # which an earlier call may have begun
-            row.low = one_low if row.low is None else np.minimum(row.low, one_low)
-            row.high = one_high if row.high is None else np.maximum(row.high, one_high)
+        begins = np.flatnonzero(np.diff(rows, prepend=rows[0] - 1))
+        lows, highs = np.minimum.reduceat(low, begins, axis=0), np.maximum.reduceat(high, begins, axis=0)
+        for number, row_low, row_high in zip(rows[begins], lows, highs, strict=True):
+            row = self._begin(int(number))  # an earlier call may have begun this row
+            row.low = row_low if row.low is None else np.minimum(row.low, row_low)
+            row.high = row_high if row.high is None else np.maximum(row.high, row_high)
 
     def _eight_bits(self, row: NDArray[Any]) -> NDArray[np.uint8]:
         scaled: NDArray[np.uint8] = (row.astype(np.uint32) * 255 // self._scale.white_dn).astype(np.uint8)
         return scaled
 
     def _begin(self, number: int) -> _Row:
-        """The row ``number``; the one before it is complete."""
+        """Return row ``number``, and finish the row before it."""
         if self._row is None or self._row.number != number:
             self._finish()
             self._row = _Row(number)
@@ -180,8 +180,8 @@ class Decimator:
         done.highs.append(row.high)
         self._row = None
 
-    def _pass_over(self, line: int, kind: int) -> None:
-        """Rows whose lines did not come; of very many the last."""
+    def _skip_to(self, line: int, kind: int) -> None:
+        """Add rows of ``kind`` for the lines before ``line``, or only the last of very many."""
         assert self._next_line is not None
         step = self._scale.step
         first, last = self._next_line // step, (line - 1) // step

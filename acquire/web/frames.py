@@ -1,11 +1,12 @@
-"""What travels to a page: framed messages on one stream, a header in JSON and a body in bytes.
+"""The messages of a page's stream, each with a JSON header and a binary body.
 
 ::
 
     u32 length of header | u32 length of body | header (UTF-8 JSON) | body          little endian
 
-The header's ``type`` is ``status``, ``news``, ``link`` (the daemon is there, or not) or ``rows``: the body of
-that is, for each of ``rows`` rows, its kind; then their low and then their high values, ``columns`` each.
+The header's ``type`` is ``state``, ``news``, ``link`` (whether the daemon is there), ``glimpse`` or ``rows``.
+The body of ``rows`` has the kind of each of ``rows`` rows, then their low and then their high values, with
+``columns`` values each.
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ def message(header: dict[str, Any], body: bytes = b"") -> bytes:
 
 
 def json_message(kind: str, facts: str) -> bytes:
-    """``facts`` is JSON already."""
+    """Return a message without a body; ``facts`` is already JSON."""
     text = f'{{"type":"{kind}","{kind}":{facts}}}'.encode()
     return HEAD.pack(len(text), 0) + text
 

@@ -1,9 +1,9 @@
-"""``python -m acquire.web.glimpse SOCKET``: the latest lines as a coarse video, again and again, on one core.
+"""``python -m acquire.web.glimpse SOCKET``: coarse videos of the latest lines, continuously, on one core.
 
-It looks at the rings as the live picture does, cuts what has just passed out of them, and solves for few
-large voxels with the solver that every reconstruction has. Each glimpse goes to standard output as a message
-of `acquire.web.frames`; the process ends when its standard input does. It stands back for everything else:
-where the host is busy, glimpses are fewer.
+It reads the rings as the live picture does, cuts the latest lines from them, and reconstructs a few large
+voxels with the ordinary solver. Each glimpse is written to standard output as a message of
+`acquire.web.frames`; the process ends when its standard input closes. Everything else takes precedence, so
+that there are fewer glimpses on a busy host.
 """
 
 from __future__ import annotations
@@ -41,21 +41,21 @@ if TYPE_CHECKING:
     from acquire.recon import Reconstruction
 
 SIDE = 24
-"""Voxels across, about."""
+"""Approximate number of voxels along each side."""
 FRAMES = 8
-"""That are sampled in full, about."""
+"""Approximate number of frames that are sampled in full."""
 PASSES = 2
-"""Lines, in passes over the sensor: of the second all is sampled in full."""
+"""Number of lines, in multiples of the stages: the scene is sampled in full during the second pass."""
 ITERATIONS = 8
 MOST_PER_S = 4.0
 LOOK_AGAIN_S = 0.5
 _NICE = 10
-"""Other programs go before it, and lose a tenth of a core where they are busy; at 19 there was no picture."""
+"""Other programs take precedence, and lose a tenth of a core if they are busy; at 19 there was no picture."""
 
 
 @dataclass(frozen=True, slots=True)
 class Sizes:
-    """Of a glimpse: lines that it is made of, and fine pixels and sub-steps per voxel."""
+    """Number of lines of a glimpse, and the fine pixels and sub-steps per voxel."""
 
     lines: int
     spatial_merge: int
@@ -69,10 +69,10 @@ class Sizes:
 
 
 class Glimpses:
-    """Of one armed run; behind a fibre, of the ``tile`` in the middle of the scene."""
+    """Makes glimpses of one armed run; behind a fibre, of the ``tile`` in the middle of the scene."""
 
     def __init__(self, config: RigConfig, rings: Rings) -> None:
-        """Raises DeviceError where the rings cannot be had."""
+        """Map the rings. Raises DeviceError if they cannot be mapped."""
         self._config = config
         self._sizes = Sizes.of(config)
         fibre, everything = config.laid_out, slice(None)
@@ -89,15 +89,15 @@ class Glimpses:
             undo.pop_all()
 
     def segment(self) -> Segment | None:
-        """What has just passed, of both arms; None where that is not whole."""
+        """Return the latest lines of both arms; None if they are not complete."""
         lines, config = self._sizes.lines, self._config
         first_line = min(peek.newest_line for peek in self._peeks.values()) - lines
-        found = [peek.stretch(first_line, lines) for peek in self._peeks.values()]
-        if first_line < 0 or any(one is None for one in found):
+        ranges = [peek.stretch(first_line, lines) for peek in self._peeks.values()]
+        if first_line < 0 or any(each is None for each in ranges):
             return None
-        seen = zip(found, self._columns, strict=True)
-        samples = np.stack([one[0][:, columns] for one, columns in seen if one is not None])
-        flags = np.stack([one[1] for one in found if one is not None])
+        pairs = zip(ranges, self._columns, strict=True)
+        samples = np.stack([each[0][:, columns] for each, columns in pairs if each is not None])
+        flags = np.stack([each[1] for each in ranges if each is not None])
         usable: NDArray[np.bool_] = samples < config.cameras.a.white_dn
         usable[(flags & (LineFlag.MISSING | LineFlag.INCOMPLETE)) != 0] = False
         geometry = config.geometry.segment(lines)
@@ -124,7 +124,7 @@ class Glimpses:
             "fast",
             iterations=ITERATIONS,
             bandwidth=1.0,
-            check=False,  # asking what explains the lines better takes ten times as long as the glimpse
+            check=False,  # testing whether other settings explain the lines better takes ten times as long
         )
 
     def close(self) -> None:
@@ -132,9 +132,11 @@ class Glimpses:
             peek.close()
 
 
-def glimpse_message(found: Reconstruction, taken_s: float, seconds: float, tile: Tile | None = None) -> bytes:
-    """The frames that were sampled in full, 8 bits over their own range."""
-    video = found.video[found.trusted]
+def glimpse_message(
+    result: Reconstruction, taken_s: float, seconds: float, tile: Tile | None = None
+) -> bytes:
+    """Return a message with the trusted frames, scaled to 8 bits."""
+    video = result.video[result.trusted]
     low, high = (float(video.min()), float(video.max())) if video.size else (0.0, 1.0)
     scaled = ((video - low) * (255 / max(high - low, 1e-12))).astype(np.uint8)
     header = {
@@ -150,7 +152,7 @@ def glimpse_message(found: Reconstruction, taken_s: float, seconds: float, tile:
 
 
 def glimpses(client: Client, is_over: Callable[[], bool]) -> Iterator[bytes]:
-    """Messages, as long as it is not over; b"" where there is nothing to be seen now."""
+    """Yield messages until ``is_over``; b"" if there are no lines to show now."""
     config = RigConfig.model_validate_json(json.dumps(client.setup().config))
     while not is_over():
         rings = client.rings()
@@ -164,9 +166,9 @@ def glimpses(client: Client, is_over: Callable[[], bool]) -> Iterator[bytes]:
                 if segment is None:
                     yield b""
                     continue
-                found = run.reconstruct(segment)
+                result = run.reconstruct(segment)
                 seconds = time.monotonic() - begun_s
-                yield glimpse_message(found, begun_s, seconds, run.tile)
+                yield glimpse_message(result, begun_s, seconds, run.tile)
                 time.sleep(max(0.0, 1 / MOST_PER_S - seconds))
 
 
@@ -174,25 +176,25 @@ def main() -> None:
     os.nice(_NICE)
     limit_blas(1)
     over = threading.Event()
-    threading.Thread(target=_end_with_owner, args=(over,), daemon=True).start()
+
+    def end_with_owner() -> None:
+        sys.stdin.read()  # returns when the owner closes it, or ends
+        over.set()
+
+    threading.Thread(target=end_with_owner, daemon=True).start()
     out = sys.stdout.buffer
     while not over.is_set():
         try:
-            for told in glimpses(Client(Path(sys.argv[1])), over.is_set):
-                if told:
-                    out.write(told)
+            for glimpse in glimpses(Client(Path(sys.argv[1])), over.is_set):
+                if glimpse:
+                    out.write(glimpse)
                     out.flush()
                 else:
                     over.wait(LOOK_AGAIN_S)
-        except AcquireError:  # the run has ended, or the daemon: both may come back
+        except AcquireError:  # the run or the daemon has ended; either may come back
             over.wait(LOOK_AGAIN_S)
         except BrokenPipeError:
             return
-
-
-def _end_with_owner(over: threading.Event) -> None:
-    sys.stdin.read()
-    over.set()
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""Owns the process that makes glimpses, while somebody looks at them; keeps the latest one, and no more."""
+"""Owns the process that makes glimpses, while a page shows them, and keeps only the latest glimpse."""
 
 from __future__ import annotations
 
@@ -16,15 +16,15 @@ if TYPE_CHECKING:
     from pathlib import Path
 
 AGAIN_S = 5.0
-"""After it has ended by itself."""
+"""Pause before the process is started again if it has ended on its own."""
 MOST_BYTES = 2**22
-"""Of one glimpse."""
+"""Largest glimpse."""
 
 log = logging.getLogger("acquire.web")
 
 
 class Glimpser:
-    """For one event loop; `run` is its life."""
+    """Belongs to one event loop, in which `run` must run."""
 
     def __init__(self, socket: Path, wake: Callable[[], None]) -> None:
         self._socket = socket
@@ -33,7 +33,7 @@ class Glimpser:
         self._changed = asyncio.Event()
         self.latest = b""
         self.number = 0
-        """Of the latest; 0: there is none."""
+        """Number of the latest glimpse; 0 if there is none."""
 
     def watch(self) -> None:
         self._watchers += 1
@@ -44,17 +44,17 @@ class Glimpser:
         self._changed.set()
 
     async def run(self) -> None:
-        """Have glimpses made while somebody watches, until cancelled."""
+        """Run the process while there are watchers, until cancelled."""
         while True:
             while not self._watchers:
                 self._changed.clear()
                 await self._changed.wait()
-            await self._follow()
+            await self._run_process()
             if self._watchers:
                 await asyncio.sleep(AGAIN_S)
 
-    async def _follow(self) -> None:
-        """One life of the process: it ends when nobody watches any more, or by itself."""
+    async def _run_process(self) -> None:
+        """Run the process once, until there are no watchers or it ends on its own."""
         process = await asyncio.create_subprocess_exec(
             sys.executable,
             "-m",
@@ -82,7 +82,7 @@ class Glimpser:
             while True:
                 head = await process.stdout.readexactly(HEAD.size)
                 size = sum(HEAD.unpack(head))
-                if size > MOST_BYTES:  # no message of ours: the stream is out of step, and another begins
+                if size > MOST_BYTES:  # the stream is out of step: the process is restarted
                     return
                 self.latest = head + await process.stdout.readexactly(size)
                 self.number += 1

@@ -1,14 +1,14 @@
-"""Every request passes here first: asked by the right name, by our own page, by somebody who has the token.
+"""Checks that every request must pass: host name, origin, token, role and rate.
 
 ::
 
-    Host        a name that is ours: a page elsewhere that points its own name at us is refused (rebinding)
-    Origin      of what changes something: our own, or none (a script)
+    Host        one of the page's names: another site that resolves to this host is refused (DNS rebinding)
+    Origin      of requests that change something: the page itself, or none (a script)
     token       Authorization: Bearer …, or the cookie that it was exchanged for; the page's files need none
-    role        a viewer changes nothing
-    rate        wrong tokens and requests per address, each in a bucket of tokens
+    role        a viewer cannot change anything
+    rate        wrong tokens and requests per address, each limited by a token bucket
 
-What is refused is told as JSON, and logged without the token.
+Refusals are answered in JSON; wrong tokens are logged, without the token itself.
 """
 
 from __future__ import annotations
@@ -35,14 +35,14 @@ if TYPE_CHECKING:
 
 API = "/api/"
 OPEN = ("/api/session", "/api/healthz")
-"""Answered without a token: one takes it, the other tells a supervisor no more than that all is well."""
+"""Paths that need no token: one receives it, the other only tells a supervisor that all is well."""
 SAFE = ("GET", "HEAD", "OPTIONS")
 REQUESTS = (240.0, 30.0)
-"""At once, and per second, of one address without a token: ten new tabs ask for twenty files each."""
+"""Burst and rate per second of requests from one address without a token. A new tab loads twenty files."""
 ADMITTED = (600.0, 60.0)
-"""The same with one: strangers behind the same address cannot use it up."""
+"""The same with a token, in a separate bucket: strangers behind the same address cannot exhaust it."""
 WRONG_TOKENS = (5.0, 0.2)
-"""Wrong tokens of one address at once, and per second."""
+"""Burst and rate per second of wrong tokens from one address."""
 MOST_ADDRESSES = 1024
 
 HEADERS = (
@@ -67,7 +67,7 @@ class _Bucket:
 
 
 class Buckets:
-    """So many at once and per second for each key; the key that was quiet for longest is forgotten first."""
+    """Token buckets by key, with a burst and a rate; the key that was idle for longest is dropped first."""
 
     def __init__(self, most: float, per_s: float, now_s: Callable[[], float] = time.monotonic) -> None:
         self._most, self._per_s, self._now_s = most, per_s, now_s
@@ -77,7 +77,7 @@ class Buckets:
         return self._filled(key).left >= 1
 
     def take(self, key: str) -> bool:
-        """One more; False where it is one too many."""
+        """Take one token; return False if there is none."""
         bucket = self._filled(key)
         if bucket.left < 1:
             return False
@@ -96,10 +96,10 @@ class Buckets:
 
 
 class Guard:
-    """Middleware. See the module."""
+    """ASGI middleware; see the module."""
 
     def __init__(self, app: ASGIApp, tokens: Tokens, names: frozenset[str]) -> None:
-        """``names``: hosts by which we may be asked for, lower case, without a port."""
+        """``names`` are the page's host names, in lower case and without a port."""
         self._app = app
         self._tokens = tokens
         self._names = names
@@ -108,7 +108,7 @@ class Guard:
         self._wrong = Buckets(*WRONG_TOKENS)
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        if scope["type"] != "http":  # the beginning and end of its life
+        if scope["type"] != "http":  # start-up and shutdown
             await self._app(scope, receive, send)
             return
 
@@ -124,42 +124,45 @@ class Guard:
     def _refusal(self, request: Request) -> JSONResponse | None:
         address = request.client.host if request.client else ""
         if _host_of(request.headers.get("host", "")) not in self._names:
-            return _refuse(421, f"this is not {shortened(request.headers.get('host', ''))}", "web.names")
-        # A bucket of its own for those with a token: strangers behind the same proxy cannot lock them out.
-        asked = self._requests if self.role_of(request) is None else self._admitted
-        if not asked.take(address):
-            return _refuse(429, "too many requests", "a second")
+            host = shortened(request.headers.get("host", ""))
+            return _refuse(421, f"the page is not served under the name {host}", "web.names")
+        # Requests with a token have their own bucket: strangers behind the same proxy cannot lock them out.
+        bucket = self._requests if self.role_of(request) is None else self._admitted
+        if not bucket.take(address):
+            return _refuse(429, "too many requests came from this address", "again in a second")
         if not request.url.path.startswith(API):
             return None
-        if request.method not in SAFE and not _is_ours(request):
-            return _refuse(403, "this request comes from a page that is not ours")
+        if request.method not in SAFE and not _is_same_origin(request):
+            return _refuse(403, "the request comes from a page of another site")
         if request.url.path in OPEN:
             return None
         return self._refusal_of_role(request, address)
 
     def _refusal_of_role(self, request: Request, address: str) -> JSONResponse | None:
         if not self._wrong.has_room(address):
-            return _refuse(429, "too many wrong tokens", "some seconds")
+            return _refuse(429, "too many wrong tokens came from this address", "again in some seconds")
         role = self.role_of(request)
         if role is None:
-            # Only what was tried counts as a guess: a page whose cookie has expired asks on its own.
+            # Only an explicit token counts as a guess: a page whose cookie has expired repeats its requests.
             if "authorization" in request.headers:
                 self.note_wrong(address)
             return _refuse(401, "the token is missing or wrong", "acquire web --link")
         if role != "operator" and request.method not in SAFE:
-            return _refuse(403, "this token is for looking only", "the operator's: acquire web --link")
+            return _refuse(
+                403, "a viewer's token cannot change anything", "the operator's token: acquire web --link"
+            )
         WHO.set(f"{role} at {address}"[:LONGEST])
         return None
 
     def role_of(self, request: Request) -> Role | None:
-        """By the token, else by the cookie."""
+        """Return the role of a request's token, or else of its cookie; None for neither."""
         scheme, _, token = request.headers.get("authorization", "").partition(" ")
         if scheme.lower() == "bearer":
             return self._tokens.role_of_token(token.strip())
         return self._tokens.role_of_cookie(request.cookies.get(COOKIE, ""))
 
     def role_of_token(self, token: str, address: str) -> Role | None:
-        """For the exchange. None as well where the address has tried too many."""
+        """Return the role of a token; also None if the address has tried too many wrong ones."""
         if not self._wrong.has_room(address):
             return None
         role = self._tokens.role_of_token(token)
@@ -173,16 +176,16 @@ class Guard:
 
 
 def _host_of(header: str) -> str:
-    """Of a Host header: without port, lower case; of [::1]:8300 the address."""
+    """Return the host of a Host header, in lower case and without a port; ::1 for [::1]:8300."""
     text = header.strip().lower()
     if text.startswith("["):
         return text[1:].partition("]")[0]
     return text.rpartition(":")[0] if text.count(":") == 1 else text
 
 
-def _is_ours(request: Request) -> bool:
-    """What a browser says of the page that sends this; a script says nothing."""
-    # Two witnesses: browsers that do not send the first yet send the second with all that changes something.
+def _is_same_origin(request: Request) -> bool:
+    """Return whether the browser states the page's own origin; scripts state none, and pass."""
+    # Two headers, because browsers that do not send the first send the second with all unsafe requests.
     site = request.headers.get("sec-fetch-site", "same-origin")
     origin = request.headers.get("origin")
     same = origin is None or origin.partition("://")[2].lower() == request.headers.get("host", "").lower()

@@ -1,7 +1,7 @@
-"""The page's one subscription to the daemon: its latest status, its news, and whether it is there at all.
+"""The page's single subscription to the daemon: its latest status, its news, and whether it answers.
 
-Every page reads from here; how many there are costs the daemon nothing. One that gives no sign of life is
-told to the pages within `LOST_S`, and is asked for again until it is back.
+All pages read from here, so that their number costs the daemon nothing. Pages are informed within `LOST_S` of
+a daemon that does not answer, and the connection is retried until it is back.
 """
 
 from __future__ import annotations
@@ -29,16 +29,16 @@ if TYPE_CHECKING:
 
 STATUS_S = 0.5
 LOST_S = 1.5
-"""Without a word from the daemon; it sends a status every `STATUS_S`."""
+"""Silence after which the daemon counts as lost; it sends a status every `STATUS_S`."""
 RETRY_S = 0.25
 MOST_NEWS = 500
-"""Kept for pages that are opened later."""
+"""Number of news items kept for pages that are opened later."""
 
 log = logging.getLogger("acquire.web")
 
 
 class Hub:
-    """For one event loop; `run` is its life."""
+    """Belongs to one event loop, in which `run` must run."""
 
     def __init__(self, socket: Path, make_live: Callable[[Callable[[], None]], Live]) -> None:
         self.client = AsyncClient(socket)
@@ -77,11 +77,11 @@ class Hub:
 
     @property
     def version(self) -> int:
-        """Rises with every change of what `state_message` tells."""
+        """Number that rises with every change of `state_message`."""
         return self._version
 
     def state_message(self) -> bytes:
-        """The latest status with its judgement; or that there is none."""
+        """Return the latest status with its health, or a message that the daemon does not answer."""
         if not self.connected or self.status is None:
             return message({"type": "link", "connected": False, "why": self.why})
         status, health = self.status.model_dump_json(), self.health().model_dump_json()
@@ -89,17 +89,17 @@ class Hub:
         return json_message("state", facts)
 
     def health(self) -> Health:
-        """Raises NoDaemonError where the daemon is not there."""
+        """Return the health of the latest status. Raises NoDaemonError if the daemon does not answer."""
         if not self.connected or self.status is None or self.setup is None:
             raise NoDaemonError(self.why, hint="acquire serve")
         return health_of(self.status, self.setup.line_rate_hz, time.monotonic() - self._armed_s)
 
     def news_after(self, number: int) -> tuple[int, list[bytes]]:
-        """Messages from place ``number`` on, as far as they are kept, and the next place."""
-        return self._count, [one for k, one in self._news if k >= number]
+        """Return the next number, and the messages from ``number`` on that are still kept."""
+        return self._count, [news for k, news in self._news if k >= number]
 
     def listen(self) -> asyncio.Event:
-        """Set whenever there is something new, until `forget`."""
+        """Return an event that is set whenever there is something new, until `forget`."""
         event = asyncio.Event()
         self._waiting.add(event)
         return event
@@ -111,31 +111,31 @@ class Hub:
 
     async def _follow(self, reader: EventReader) -> None:
         self.setup = await self.client.setup()
-        async for one in self.client.follow(reader, history=True, status_s=STATUS_S):
+        async for item in self.client.follow(reader, history=True, status_s=STATUS_S):
             self._heard_s = time.monotonic()
-            if isinstance(one, News):
-                self._news.append((self._count, json_message("news", one.model_dump_json())))
+            if isinstance(item, News):
+                self._news.append((self._count, json_message("news", item.model_dump_json())))
                 self._count += 1
-            elif one is not None:
-                await self._take(one)
+            elif item is not None:
+                await self._take_status(item)
             self._wake()
 
-    async def _take(self, status: Status) -> None:
+    async def _take_status(self, status: Status) -> None:
         if not self.connected:
             log.info("connected to the daemon (process %d)", status.pid)
         self.connected, self.status = True, status
         self._version += 1
-        if status.run_id != self._run_id:  # each run has rings of its own
+        if status.run_id != self._run_id:  # each run has its own rings
             self._run_id = status.run_id
             self._armed_s = time.monotonic()
             self.live.show(None if status.run_id is None else await self.client.rings(), self.setup)
 
     async def _watch(self) -> None:
-        """A daemon that hangs sends nothing, and its connection does not break."""
+        """Detect a daemon that hangs: it sends nothing, but its connection stays open."""
         while True:
             await asyncio.sleep(RETRY_S)
             if self.connected and time.monotonic() - self._heard_s > LOST_S:
-                self._lose(NoDaemonError(f"the daemon has not said anything for {LOST_S:g} s"))
+                self._lose(NoDaemonError(f"the daemon has not sent anything for {LOST_S:g} s"))
 
     def _lose(self, error: Exception) -> None:
         if self.connected:
@@ -151,10 +151,10 @@ class Hub:
             event.set()
 
     def _wake_from_thread(self) -> None:
-        if not self._loop.is_closed():  # the looking thread may outlive it by a turn
+        if not self._loop.is_closed():  # the live thread may outlive the loop for a moment
             self._loop.call_soon_threadsafe(self._wake)
 
     @property
     def is_recording(self) -> bool:
-        """Something is being written: what else wants the disk or the processors stands back."""
+        """True while a recording is being written, which takes precedence on disk and processors."""
         return self.status is not None and self.status.state in (State.RECORDING, State.DRAINING)

@@ -1,4 +1,4 @@
-"""What a job is as a command of ours: its words, the name of what it makes, and how it says how far it is."""
+"""Jobs as `acquire` commands: their arguments, the names of their results, and their progress reports."""
 
 from __future__ import annotations
 
@@ -15,11 +15,12 @@ if TYPE_CHECKING:
 
     from acquire.web.messages import CalibrationRequest, JobRequest
 
-MOST_SAID = 300
+MOST_TEXT = 300
+"""Longest progress text, in characters."""
 
 
 def free_name(directory: Path, request: JobRequest) -> str:
-    """Of what is made: after recording, lines and voxels. Raises UsageError."""
+    """Return an unused name for the result, from recording, lines and voxels. Raises UsageError."""
     stem = f"{request.recording.removesuffix('.zarr')}-{request.first_line}-{request.lines}"
     if request.kind == "cut":
         suffix = ".npz"
@@ -31,50 +32,48 @@ def free_name(directory: Path, request: JobRequest) -> str:
         name = f"{stem}{f'-{number}' if number > 1 else ''}{suffix}"
         if not os.path.lexists(directory / name):
             return name
-    raise UsageError(f"there are a thousand of {stem} already", hint="remove some")
+    raise UsageError(f"there are already a thousand results named {stem}", hint="remove some")
 
 
 def recording_words(request: JobRequest, name: str) -> list[str]:
-    """The command that makes ``name`` of a recording."""
+    """Return the arguments of the command that makes ``name`` from a recording."""
     lines = ["--first-line", str(request.first_line), "--lines", str(request.lines), "--out", name, "--json"]
     if request.kind == "cut":
         return ["cut", request.recording, *lines]
     if request.kind == "preview":
         return ["reconstruct", request.recording, *lines, "--preview", "--workers", "1"]
     voxels = ["--spatial-merge", str(request.spatial_merge), "--temporal-merge", str(request.temporal_merge)]
-    how = [*voxels, "--preset", request.preset, "--workers", "1"]
-    return ["reconstruct", request.recording, *lines, *how]
+    return ["reconstruct", request.recording, *lines, *voxels, "--preset", request.preset, "--workers", "1"]
 
 
 def calibration_words(request: CalibrationRequest, out: Path) -> list[str]:
-    """The command that carries out a step of the calibration at ``out``, as somebody at the host gives it."""
+    """Return the arguments of the command that carries out a step of the calibration at ``out``."""
     steps = {"delay": ["delay"], "linearity": ["linearity"]}
     words = ["calibrate", *steps.get(request.step, ["all", "--only", request.step])]
     lines = [] if request.lines is None else ["--lines", str(request.lines)]
     return [*words, "--yes", "--out", str(out), "--directory", RECORDINGS, *lines, "--json"]
 
 
-def told(line: str) -> dict[str, Any]:
-    """What a line on a command's standard error changes of a job's facts: words, and how far it is."""
+def progress_facts(line: str) -> dict[str, Any]:
+    """Return the job's facts that a line on a command's standard error changes: text, done and total."""
     try:
         facts = json.loads(line)
     except ValueError:
-        return {"text": shortened(line.strip().removeprefix("acquire: "), MOST_SAID)}
+        return {"text": shortened(line.strip().removeprefix("acquire: "), MOST_TEXT)}
     if not isinstance(facts, dict):
-        return {"text": shortened(line.strip(), MOST_SAID)}
+        return {"text": shortened(line.strip(), MOST_TEXT)}
     if isinstance(error := facts.get("error"), dict):
-        words = [error.get("message", ""), *_after("possible", error), *_after("hint", error, "try")]
-        return {"text": shortened("; ".join(map(str, words)), MOST_SAID)}
+        parts = [str(error.get("message", ""))]
+        for key, word in (("possible", "possible"), ("hint", "try")):
+            if error.get(key):
+                parts.append(f"{word}: {error[key]}")
+        return {"text": shortened("; ".join(parts), MOST_TEXT)}
     if isinstance(progress := facts.get("progress"), dict):
-        left = progress.get("left_s")
-        ahead = "" if left is None else f", about {left:.0f} s left"
+        left_s = progress.get("left_s")
+        remaining = "" if left_s is None else f", about {left_s:.0f} s left"
         return {
-            "text": shortened(f"{progress.get('what', 'working')}{ahead}", MOST_SAID),
+            "text": shortened(f"{progress.get('what', 'working')}{remaining}", MOST_TEXT),
             "done": progress.get("done"),
             "total": progress.get("total"),
         }
-    return {"text": shortened(", ".join(map(str, facts.values())), MOST_SAID)}
-
-
-def _after(key: str, error: dict[str, Any], word: str = "") -> list[str]:
-    return [f"{word or key}: {error[key]}"] if error.get(key) else []
+    return {"text": shortened(", ".join(map(str, facts.values())), MOST_TEXT)}

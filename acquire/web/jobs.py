@@ -1,11 +1,12 @@
-"""Work that takes its time, as commands of ours: one at a time, niced, each with what it said last.
+"""Long-running work as `acquire` commands, one at a time and niced, each with its latest progress.
 
 ::
 
     waiting ──▶ running ──▶ done | failed | stopped
 
-A step of a calibration does not stand in the queue: whoever has put a target in waits in front of it. It has
-the instrument, so there is one at most, and it is always asked to end, so that it leaves that as it was.
+A calibration step bypasses the queue, because the operator is waiting at the instrument with the target in
+place. It occupies the instrument, so only one runs at a time, and it is always asked to end before it is
+killed, so that it leaves the instrument as it was.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ from typing import TYPE_CHECKING
 from acquire.daemon.who import WHO
 from acquire.errors import AcquireError, PlaceError, StateError
 from acquire.web.calibrations import step_of
-from acquire.web.job_words import calibration_words, free_name, recording_words, told
+from acquire.web.job_words import calibration_words, free_name, progress_facts, recording_words
 from acquire.web.messages import CalibrationRequest, JobFacts, JobRequest
 
 if TYPE_CHECKING:
@@ -33,11 +34,11 @@ if TYPE_CHECKING:
 MOST_WAITING = 16
 MOST_LISTED = 50
 END_S = 15.0
-"""For a job that is to stop: it keeps the best it has."""
+"""Time for a stopped job to save its best result so far."""
 CALIBRATION_END_S = 180.0
-"""A step seals what it records, looks at what it has, and leaves the instrument as it was."""
+"""Time for a stopped step to seal its recording, evaluate it and leave the instrument as it was."""
 LEAVE_S = 3.0
-"""For a step when the page ends: the daemon does not wait much longer for that."""
+"""Time for a step when the page ends, for which the daemon does not wait much longer."""
 STARTING_S = 0.02
 MOST_LINE_BYTES = 2**16
 
@@ -54,12 +55,12 @@ class _Job:
     process: asyncio.subprocess.Process | None = None
     ending: asyncio.Task[None] | None = None
 
-    def become(self, **facts: object) -> None:
+    def update(self, **facts: object) -> None:
         self.facts = self.facts.model_copy(update=facts)
 
 
 class Jobs:
-    """For one event loop; `run` is its life."""
+    """Belongs to one event loop, in which `run` must run."""
 
     def __init__(self, directory: Path, archive: Archive, socket: Path) -> None:
         self._directory, self._socket = directory, socket
@@ -70,11 +71,11 @@ class Jobs:
         self._step: asyncio.Task[None] | None = None
 
     def list(self) -> list[JobFacts]:
-        """The newest first."""
+        """Return the jobs, newest first."""
         return [job.facts for job in reversed(self._jobs.values())]
 
     def add(self, request: JobRequest) -> JobFacts:
-        """Raises PlaceError where there is no such recording, StateError where too much waits already."""
+        """Queue a job. Raises PlaceError if there is no such recording, StateError if the queue is full."""
         self._archive.path_of(request.recording)
         if sum(job.facts.state == "waiting" for job in self._jobs.values()) >= MOST_WAITING:
             raise StateError(f"{MOST_WAITING} jobs are waiting already", hint="stop one of them")
@@ -91,13 +92,15 @@ class Jobs:
         return facts
 
     def calibrate(self, request: CalibrationRequest, out: Path) -> JobFacts:
-        """Carry a step out at once, for the calibration at ``out``.
+        """Carry out a step at once, for the calibration at ``out``.
 
-        Raises UsageError for a step that there is not, StateError while another one is under way.
+        Raises UsageError if there is no such step, StateError while another step is running.
         """
         step = step_of(request)
         if any(job.facts.state == "running" for job in self._jobs.values() if job.facts.kind == "calibrate"):
-            raise StateError("a step of the calibration is under way", hint="when it is done; or cancel it")
+            raise StateError(
+                "a calibration step is already running", hint="wait until it is done, or stop it"
+            )
         facts = JobFacts(
             id=self._next(), kind="calibrate", step=step.name, lines=request.lines, state="running"
         )
@@ -112,27 +115,29 @@ class Jobs:
 
     def _keep(self, job: _Job) -> None:
         self._jobs[job.facts.id] = job
-        over = [number for number, job in self._jobs.items() if job.facts.state not in ("waiting", "running")]
-        for number in over[: max(0, len(self._jobs) - MOST_LISTED)]:
+        ended = [
+            number for number, job in self._jobs.items() if job.facts.state not in ("waiting", "running")
+        ]
+        for number in ended[: max(0, len(self._jobs) - MOST_LISTED)]:
             del self._jobs[number]
 
     async def stop(self, number: int) -> JobFacts:
-        """End a job; one under way keeps the best that it has. Raises PlaceError."""
+        """Stop a job; a running one saves its best result so far. Raises PlaceError."""
         job = self._jobs.get(number)
         if job is None:
             raise PlaceError(f"there is no job {number}", possible="/api/jobs")
         if job.facts.state == "waiting":
-            job.become(state="stopped")
+            job.update(state="stopped")
         elif job.facts.state == "running" and job.ending is None:
-            job.become(text="ending with what there is")
-            job.ending = asyncio.create_task(_end_of(job))
+            job.update(text="ending with the result so far")
+            job.ending = asyncio.create_task(_stop_process(job))
         return job.facts
 
     async def run(self) -> None:
-        """Work until cancelled; what is under way then is ended."""
+        """Carry out jobs until cancelled; a running job is then ended."""
         try:
             while True:
-                job = next((one for one in self._jobs.values() if one.facts.state == "waiting"), None)
+                job = next((each for each in self._jobs.values() if each.facts.state == "waiting"), None)
                 if job is None:
                     self._added.clear()
                     await self._added.wait()
@@ -145,16 +150,16 @@ class Jobs:
 
     async def _try(self, job: _Job) -> None:
         try:
-            await self._do(job)
+            await self._carry_out(job)
         except (OSError, AcquireError) as error:
-            job.become(state="failed", text=str(error))
+            job.update(state="failed", text=str(error))
 
-    async def _do(self, job: _Job) -> None:
+    async def _carry_out(self, job: _Job) -> None:
         name, words = "", job.words
         if isinstance(job.request, JobRequest):
             name = free_name(self._directory, job.request)
             words = recording_words(job.request, name)
-        job.become(state="running", text="starting")
+        job.update(state="running", text="starting")
         job.process = await asyncio.create_subprocess_exec(
             sys.executable,
             "-m",
@@ -166,49 +171,50 @@ class Jobs:
             stdout=asyncio.subprocess.DEVNULL,
             stderr=asyncio.subprocess.PIPE,
             limit=MOST_LINE_BYTES,
-            process_group=0,  # its workers are ended with it, and a Ctrl-C on our terminal is not theirs
+            # Workers are ended with their job, and a Ctrl-C on the page's terminal does not reach them.
+            process_group=0,
         )
         try:
-            await _listen(job)
+            await _follow_progress(job)
             code = await job.process.wait()
         except asyncio.CancelledError:
-            # The page ends. A step of a calibration may have changed the instrument, and is asked first.
+            # The page ends. A calibration step may have changed the instrument, so it is interrupted first.
             if job.facts.kind == "calibrate":
-                await _end(job.process, LEAVE_S, asked=job.ending is not None)
+                await _end(job.process, LEAVE_S, interrupted=job.ending is not None)
             _signal(job.process, signal.SIGKILL)
             await job.process.wait()
             raise
-        made = name if name and os.path.lexists(self._directory / name) else None
+        result = name if name and os.path.lexists(self._directory / name) else None
         state = "stopped" if job.ending is not None else "failed" if code else "done"
         text = job.facts.text if state == "failed" else ""
         if state == "stopped":
-            kept = made if name else not code
-            text = "what it had is kept" if kept else "nothing was kept"
-        job.become(state=state, text=text, result=made)
-        about = job.facts.step or job.facts.recording
-        log.info("job %d, %s of %s: %s", job.facts.id, job.facts.kind, about, state)
+            kept = result if name else not code
+            text = "the result so far was kept" if kept else "nothing was kept"
+        job.update(state=state, text=text, result=result)
+        subject = job.facts.step or job.facts.recording
+        log.info("job %d, %s of %s: %s", job.facts.id, job.facts.kind, subject, state)
 
 
-async def _listen(job: _Job) -> None:
-    """Until it says no more; its latest words are the job's."""
+async def _follow_progress(job: _Job) -> None:
+    """Copy a job's progress reports into its facts, until it closes its standard error."""
     assert job.process is not None
     assert job.process.stderr is not None
-    with contextlib.suppress(ValueError):  # a line without an end: the rest is not listened to
+    with contextlib.suppress(ValueError):  # raised for a line that is too long; the rest is then ignored
         async for line in job.process.stderr:
             if job.ending is None:
-                job.become(**told(line.decode(errors="replace")))
+                job.update(**progress_facts(line.decode(errors="replace")))
 
 
-async def _end_of(job: _Job) -> None:
+async def _stop_process(job: _Job) -> None:
     while job.process is None and job.facts.state == "running":
         await asyncio.sleep(STARTING_S)
     if job.process is not None:
         await _end(job.process, job.end_s)
 
 
-async def _end(process: asyncio.subprocess.Process, end_s: float, *, asked: bool = False) -> None:
-    """By word, unless it was asked already, then by force."""
-    if not asked:  # a second word would mean: at once, and leave everything as it lies
+async def _end(process: asyncio.subprocess.Process, end_s: float, *, interrupted: bool = False) -> None:
+    """Interrupt a process, unless it already was, and kill it if it does not end in time."""
+    if not interrupted:  # a second interrupt would make it end at once, without cleaning up
         _signal(process, signal.SIGINT)
     try:
         async with asyncio.timeout(end_s):
@@ -218,6 +224,6 @@ async def _end(process: asyncio.subprocess.Process, end_s: float, *, asked: bool
 
 
 def _signal(process: asyncio.subprocess.Process, number: signal.Signals) -> None:
-    """To the process and its workers."""
+    """Send a signal to a process and its workers."""
     with contextlib.suppress(ProcessLookupError):
         os.killpg(process.pid, number)

@@ -1,7 +1,7 @@
-"""The live picture: a thread that looks at the rings while somebody watches, and keeps two seconds.
+"""The live picture: a thread that reads the rings while a page is watching, and keeps two seconds.
 
-Every page reads the same messages, each from its own place; one that is too slow finds that what it has not
-read is gone, and goes on with what is new. Nobody watching: nothing is looked at, nothing mapped.
+All pages read the same messages, each from its own position. A page that is too slow misses messages that are
+no longer kept, and continues with newer ones. If no page is watching, the rings are not even mapped.
 """
 
 from __future__ import annotations
@@ -28,16 +28,16 @@ TURN_S = 0.05
 """Twenty pictures a second."""
 KEPT_S = 2.0
 MOST_BLOCKS = 4096
-"""Looked at in one turn; the rest waits for the next."""
+"""Largest number of blocks read per turn; the rest waits for the next."""
 
 log = logging.getLogger("acquire.web")
 
 
 class Live:
-    """`watch`, `leave`, `show` and `after` are for the event loop's thread; the rest is the looker's."""
+    """The event loop calls `watch`, `leave`, `show` and `after`; everything else runs in the thread."""
 
     def __init__(self, wake: Callable[[], None]) -> None:
-        """``wake``: called from the looking thread when there is something new."""
+        """``wake`` is called from the thread when there is something new."""
         self._wake = wake
         self._messages: deque[tuple[int, bytes]] = deque(maxlen=round(2 * KEPT_S / TURN_S))
         self._lock = threading.Lock()
@@ -48,7 +48,7 @@ class Live:
         self._ended = False
         self._thread = threading.Thread(target=self._run, name="live", daemon=True)
         self.error = ""
-        """Why there is no picture, in words."""
+        """The reason why there is no picture."""
 
     def begin(self) -> None:
         self._thread.start()
@@ -60,12 +60,12 @@ class Live:
         self._thread.join(10.0)
 
     def show(self, rings: Rings | None, setup: Setup | None) -> None:
-        """Look at these rings from now on; None: at none."""
+        """Read these rings from now on, or none."""
         self._wanted = (rings, setup) if rings is not None and setup is not None and rings.arms else None
         self._changed.set()
 
     def watch(self) -> int:
-        """Somebody watches; the place in the stream of pictures that comes next."""
+        """Register a watcher and return the number of the next message."""
         self._watchers += 1
         self._changed.set()
         return self._count
@@ -75,11 +75,11 @@ class Live:
         self._changed.set()
 
     def after(self, number: int) -> tuple[int, list[bytes]]:
-        """Messages from place ``number`` on, as far as they are kept, and the next place."""
+        """Return the next number, and the messages from ``number`` on that are still kept."""
         with self._lock:
-            return self._count, [one for k, one in self._messages if k >= number]
+            return self._count, [content for k, content in self._messages if k >= number]
 
-    # ---- the thread that looks
+    # ---- the thread
 
     def _run(self) -> None:
         while not self._ended:
@@ -89,7 +89,7 @@ class Live:
                 self._changed.clear()
                 continue
             try:
-                self._look_at(*wanted)
+                self._read(*wanted)
             except AcquireError as error:
                 if str(error) != self.error:
                     log.warning("live picture: %s", error)
@@ -97,31 +97,31 @@ class Live:
                 self._changed.wait(1.0)
                 self._changed.clear()
 
-    def _look_at(self, rings: Rings, setup: Setup) -> None:
-        """Until other rings are wanted, or none. Raises DeviceError where they cannot be had."""
-        eyes: dict[str, _Eye] = {}
+    def _read(self, rings: Rings, setup: Setup) -> None:
+        """Read rings until others are wanted, or none. Raises DeviceError if they cannot be mapped."""
+        arms: dict[str, _ArmReader] = {}
         try:
             for arm, place in rings.arms.items():
-                eyes[arm] = _Eye(arm, place.path, shape_of(place), setup)
+                arms[arm] = _ArmReader(arm, place.path, shape_of(place), setup)
             self.error = ""
             while not self._ended and self._watchers and self._wanted == (rings, setup):
                 began_s = time.monotonic()
-                for eye in eyes.values():
-                    if (told := eye.look()) is not None:
+                for reader in arms.values():
+                    if (content := reader.read()) is not None:
                         with self._lock:
-                            self._messages.append((self._count, told))
+                            self._messages.append((self._count, content))
                             self._count += 1
                 self._wake()
                 left_s = TURN_S - (time.monotonic() - began_s)
                 if left_s > 0:
                     time.sleep(left_s)
         finally:
-            for eye in eyes.values():
-                eye.close()
+            for reader in arms.values():
+                reader.close()
 
 
-class _Eye:
-    """On one arm."""
+class _ArmReader:
+    """Reads the ring of one arm."""
 
     def __init__(self, arm: str, path: str, shape: RingShape, setup: Setup) -> None:
         self._arm = arm
@@ -135,8 +135,8 @@ class _Eye:
             "white_dn": setup.white_dn,
         }
 
-    def look(self) -> bytes | None:
-        """What has come since the last time."""
+    def read(self) -> bytes | None:
+        """Return a message with the rows completed since the last call; None if there are none."""
         newest_ns = 0
         for _ in range(MOST_BLOCKS):
             block = self._peek.next()
@@ -144,10 +144,10 @@ class _Eye:
                 break
             first_line, count, lost = block.first_line, len(block.flags), bool(block.losses)
             lines = self._decimator.sampled_lines(first_line, count)
-            pixels = block.pixels[lines - first_line]  # a copy: the block may be overwritten at any moment
+            pixels = block.pixels[lines - first_line]  # a copy, because the block may be overwritten any time
             newest_ns = block.time_ns
-            del block  # a view of the ring keeps its memory mapped
-            if self._peek.took():
+            del block  # a view of the ring would keep its memory mapped
+            if self._peek.took():  # the block was not overwritten while it was copied
                 self._decimator.add(first_line, count, lines, pixels, lost=lost)
         rows = self._decimator.take()
         if rows is None:

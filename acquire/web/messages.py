@@ -1,4 +1,4 @@
-"""What the page's own routes tell and take, beside those of the daemon's API."""
+"""Requests and answers of the page's own routes, in addition to those of the daemon's API."""
 
 from __future__ import annotations
 
@@ -12,23 +12,23 @@ MOST_LINES = 2**53
 
 
 class SessionRequest(Message):
-    """A token for a cookie."""
+    """A token to be exchanged for a cookie."""
 
     token: str = Field(max_length=256)
 
 
 class Session(Message):
-    """Who is asking."""
+    """The role of the caller."""
 
     role: Literal["operator", "viewer"]
 
 
 class RecordingFacts(Message):
-    """A recording at a glance."""
+    """Summary of a recording."""
 
     name: Text
     run_id: Text | None = None
-    state: Text = Field(default="", description="recording, or sealed; empty where it cannot be read")
+    state: Text = Field(default="", description="recording or sealed; empty if it cannot be read")
     condition: Text | None = None
     end_reason: Text | None = None
     first_line: int = 0
@@ -39,14 +39,14 @@ class RecordingFacts(Message):
     start_ns: int | None = None
     lost_lines: dict[str, int] = Field(default={})
     events: int = 0
-    held: bool = Field(default=False, description="some of its lines are kept from retention")
-    uploaded: Text | None = Field(default=None, description="where it is copied to")
+    held: bool = Field(default=False, description="some of its lines are protected from retention")
+    uploaded: Text | None = Field(default=None, description="URL to which it is copied")
     damage: Text | None = None
     error: Text | None = Field(default=None, description="why it cannot be read")
 
 
 class EventFacts(Message):
-    """On the recording's time line."""
+    """An event of a recording."""
 
     kind: Text
     line: int
@@ -54,7 +54,7 @@ class EventFacts(Message):
 
 
 class GapFacts(Message):
-    """Lines that were lost."""
+    """A range of lost lines."""
 
     arm: str
     first_line: int
@@ -63,7 +63,7 @@ class GapFacts(Message):
 
 
 class HoldFacts(Message):
-    """Lines that are kept."""
+    """A range of lines that retention keeps."""
 
     first_line: int
     count: int
@@ -71,7 +71,7 @@ class HoldFacts(Message):
 
 
 class RecordingDetail(RecordingFacts):
-    """And what happened in it."""
+    """A recording with its events, gaps and holds."""
 
     event_list: list[EventFacts] = Field(default=[])
     gap_list: list[GapFacts] = Field(default=[])
@@ -79,7 +79,7 @@ class RecordingDetail(RecordingFacts):
 
 
 class HoldRequest(Message):
-    """Lines to be kept."""
+    """A range of lines to protect from retention."""
 
     first_line: int = Field(strict=True, ge=0, le=MOST_LINES)
     lines: int = Field(strict=True, ge=1, le=MOST_LINES)
@@ -96,15 +96,15 @@ class VideoFacts(Message):
     interval_ns: float = 0.0
     start_ns: int | None = None
     trusted: tuple[int, int] | None = Field(
-        default=None, description="the first frame and the one after the last that were sampled in full"
+        default=None, description="first and end of the frames that were sampled in full"
     )
-    low: float = Field(default=0.0, description="shown black")
-    high: float = Field(default=1.0, description="shown white")
+    low: float = Field(default=0.0, description="value shown as black")
+    high: float = Field(default=1.0, description="value shown as white")
     error: Text | None = None
 
 
 class JobRequest(Message):
-    """Work on a recording that takes its time."""
+    """Long-running work on a recording."""
 
     kind: Literal["reconstruct", "preview", "cut"]
     recording: str = Field(max_length=255)
@@ -116,48 +116,48 @@ class JobRequest(Message):
 
 
 class CalibrationRequest(Message):
-    """A step of the calibration, with what it needs in place already."""
+    """A calibration step to carry out; the target it needs must be in place."""
 
     step: str = Field(max_length=64)
     lines: int | None = Field(
-        default=None, strict=True, ge=1, le=2**20, description="of each recording; absent: as many as usual"
+        default=None, strict=True, ge=1, le=2**20, description="lines of each recording; absent: the default"
     )
 
 
 class JobFacts(Message):
-    """A job and what became of it."""
+    """A job and its result."""
 
     id: int
     kind: Literal["reconstruct", "preview", "cut", "calibrate"]
-    recording: Text = Field(default="", description="empty: it makes recordings of its own")
-    step: Text | None = Field(default=None, description="of the calibration")
+    recording: Text = Field(default="", description="its input; empty: it makes its own recordings")
+    step: Text | None = Field(default=None, description="step of the calibration")
     first_line: int = 0
-    lines: int | None = Field(default=None, description="absent: as many as it takes")
+    lines: int | None = Field(default=None, description="absent: as many as it needs")
     state: Literal["waiting", "running", "done", "failed", "stopped"]
-    text: Text = Field(default="", description="what it does, or why it failed")
-    done: float | None = Field(default=None, description="so much of it")
-    total: float | None = Field(default=None, description="of so much")
-    result: Text | None = Field(default=None, description="name of what it made")
+    text: Text = Field(default="", description="its current activity, or why it failed")
+    done: float | None = Field(default=None, description="amount of work done")
+    total: float | None = Field(default=None, description="total amount of work")
+    result: Text | None = Field(default=None, description="name of its result")
 
 
 class FindingFacts(Message):
-    """What one step of a calibration found, in words."""
+    """A finding of a calibration step, as text."""
 
     name: Text
     made: Text
     lines: int
-    facts: dict[str, Text] = Field(description="what → value and uncertainty")
+    facts: dict[str, Text] = Field(description="quantity → value and uncertainty")
     warnings: list[Text]
 
 
 class StepFacts(Message):
-    """A step: what is to be done before it, and what it found the last time."""
+    """A step, with its preparation and its latest findings."""
 
     name: str
     prepare: str
-    lines: int | None = Field(description="of each recording, as usual; null: as many as it takes")
+    lines: int | None = Field(description="default lines of each recording; null: as many as it needs")
     least_lines: int
-    after: str = Field(description="the step that it needs; empty: none")
+    after: str = Field(description="the step that must precede it; empty: none")
     found: list[FindingFacts]
 
 
@@ -165,6 +165,6 @@ class CalibrationFacts(Message):
     """The calibration of this instrument."""
 
     path: Text
-    named: bool = Field(description="by the rig: recordings get a copy of it")
+    named: bool = Field(description="the rig names it, so that recordings get a copy of it")
     error: Text | None = Field(default=None, description="why it cannot be read")
     steps: list[StepFacts]

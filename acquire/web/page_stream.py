@@ -1,7 +1,7 @@
-"""One stream per page that is seen: state, news and pictures on one connection, of which a browser has six.
+"""One stream per visible page: state, news and pictures on one connection, of which a browser has six.
 
-Nothing is queued for a page. It is woken, takes what is new from its places in the two logs, and writes it; a
-page that reads slowly takes the newest pictures, and one that does not read at all is disconnected.
+Nothing is queued for a page. It is woken, reads what is new from its positions in the two logs, and writes
+it. A page that reads slowly gets the newest pictures, and one that does not read at all is disconnected.
 """
 
 from __future__ import annotations
@@ -20,9 +20,9 @@ if TYPE_CHECKING:
 
 MOST_PAGES = 24
 LEAST_S = 0.045
-"""Between two writes: twenty a second."""
+"""Shortest time between two writes, which are then about twenty per second."""
 STATE_S = 0.5
-"""Longest time without a word: a page that hears nothing for two seconds says so."""
+"""Longest time between two states: a page that receives nothing for two seconds shows a warning."""
 
 
 class Pages:
@@ -33,7 +33,7 @@ class Pages:
         self._open = 0
 
     def open(self, *, pictures: bool, glimpses: bool) -> AsyncIterator[bytes]:
-        """The messages of a page (`acquire.web.frames`). Raises StateError where there are too many pages."""
+        """Return a page's messages (`acquire.web.frames`). Raises StateError if there are too many pages."""
         if self._open >= MOST_PAGES:
             raise StateError(f"{MOST_PAGES} pages are open already", hint="close one of them")
         return self._stream(pictures=pictures, glimpses=glimpses)
@@ -47,25 +47,25 @@ class Pages:
         self._open += 1
         woken = hub.listen()
         place = hub.live.watch() if pictures else 0
-        # From the first news that is kept: a page that is opened later shows what has happened before.
-        heard, version, told_s, seen = 0, -1, 0.0, hub.glimpser.number
+        # News start with the oldest that is kept: a page that is opened later shows earlier events, too.
+        next_news, version, state_s, glimpse = 0, -1, 0.0, hub.glimpser.number
         if glimpses:
             hub.glimpser.watch()
         try:
             while True:
                 woken.clear()
                 parts: list[bytes] = []
-                heard, news = hub.news_after(heard)
+                next_news, news = hub.news_after(next_news)
                 now_s = time.monotonic()
-                if hub.version != version or news or now_s - told_s >= STATE_S:
-                    version, told_s = hub.version, now_s
+                if hub.version != version or news or now_s - state_s >= STATE_S:
+                    version, state_s = hub.version, now_s
                     parts.append(hub.state_message())
                 parts += news
                 if pictures:
                     place, rows = hub.live.after(place)
                     parts += rows
-                if glimpses and hub.glimpser.number != seen:
-                    seen = hub.glimpser.number
+                if glimpses and hub.glimpser.number != glimpse:
+                    glimpse = hub.glimpser.number
                     parts.append(hub.glimpser.latest)
                 if parts:
                     yield b"".join(parts)

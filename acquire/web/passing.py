@@ -1,4 +1,4 @@
-"""The daemon's API as the page's process offers it: passed on, and logged with who asked."""
+"""The daemon's API as offered by the page's process: calls are forwarded, and logged with their caller."""
 
 from __future__ import annotations
 
@@ -63,8 +63,8 @@ class Passing:
         self, last_id: str | None, status_s: float | None, *, history: bool
     ) -> AsyncIterator[str]:
         reader = core.EventReader(last_id)
-        async for one in self._client.follow(reader, history=history, status_s=status_s):
-            if one is None:
+        async for item in self._client.follow(reader, history=history, status_s=status_s):
+            if item is None:
                 yield ALIVE
             else:
-                yield status_text(one) if isinstance(one, Status) else news_text(one)
+                yield status_text(item) if isinstance(item, Status) else news_text(item)

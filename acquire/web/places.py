@@ -1,4 +1,4 @@
-"""From what the daemon tells of a ring to its shape."""
+"""The shape of a ring, from the daemon's description."""
 
 from __future__ import annotations
 

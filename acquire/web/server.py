@@ -1,4 +1,4 @@
-"""The page's process: it listens, serves until a signal, and stands back for those who capture."""
+"""The page's process: it serves until a signal arrives, and gives precedence to the capture processes."""
 
 from __future__ import annotations
 
@@ -71,20 +71,20 @@ async def _serve(
 
 
 class BoundedConnection(Connection):
-    """As the daemon's: a request and a reader have so much time, and there are only so many connections."""
+    """A connection as the daemon's, with limits on the time of requests and readers and on their number."""
 
     most_connections = MOST_CONNECTIONS
 
 
 def names_of(config: WebConfig) -> frozenset[str]:
-    """By which the page may be asked for, lower case."""
+    """Return the host names of the page, in lower case."""
     loopback = {"localhost", "127.0.0.1", "::1"} if config.is_loopback else set()
     anywhere = {sockets.gethostname().lower()} if config.host in ("0.0.0.0", "::") else set()  # noqa: S104
     return frozenset({config.host.lower(), *map(str.lower, config.names), *loopback, *anywhere})
 
 
 def address_of(config: WebConfig, listener: sockets.socket | None = None) -> str:
-    """The page's URL, as a browser on this host asks for it."""
+    """Return the page's URL for a browser on this host."""
     port = config.port if listener is None else listener.getsockname()[1]
     host = config.names[0] if config.names else config.host
     host = f"[{host}]" if ":" in host else host
@@ -92,19 +92,19 @@ def address_of(config: WebConfig, listener: sockets.socket | None = None) -> str
 
 
 def link(config: WebConfig, socket: Path, role: str) -> str:
-    """The URL with a token, behind a #, where browsers keep it to themselves."""
+    """Return the URL with a token, in the fragment after #, which browsers do not send to servers."""
     tokens = load_tokens(config.token_path(socket))
     return f"{address_of(config)}#token={tokens.operator if role == 'operator' else tokens.viewer}"
 
 
 def directory_of(socket: Path) -> Path:
-    """Where the daemon's recordings lie. Raises NoDaemonError."""
+    """Return the directory of the daemon's recordings. Raises NoDaemonError."""
     from pathlib import Path as Directory
 
-    found = Client(socket).status().disk
-    if found is None:
-        raise NoDaemonError("the daemon has not looked at its disk yet", hint="again in a moment")
-    return Directory(found.directory)
+    disk = Client(socket).status().disk
+    if disk is None:
+        raise NoDaemonError("the daemon has not checked its disk yet", hint="try again in a moment")
+    return Directory(disk.directory)
 
 
 def _listen(config: WebConfig) -> sockets.socket:
@@ -119,7 +119,7 @@ def _listen(config: WebConfig) -> sockets.socket:
         why = error.strerror if isinstance(error, OSError) else "no such host"
         raise UsageError(
             f"the page cannot listen on {config.host}:{config.port}: {why}",
-            hint="another web.port, or 0 for any that is free",
+            hint="choose another web.port, or 0 for any free port",
         ) from error
     return listener
 
@@ -128,7 +128,7 @@ def _tls(config: WebConfig) -> ssl.SSLContext | None:
     if config.certificate is None:
         return None
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
-    context.minimum_version = ssl.TLSVersion.TLSv1_2  # those before are withdrawn (RFC 8996)
+    context.minimum_version = ssl.TLSVersion.TLSv1_2  # earlier versions are deprecated (RFC 8996)
     try:
         context.load_cert_chain(config.certificate, config.key)
     except (OSError, ssl.SSLError) as error:

@@ -1,8 +1,8 @@
-"""Who may enter: a token for those who steer and one for those who look, in a file that only its owner reads.
+"""Access tokens of operators and viewers, in a file that only its owner can read.
 
-A browser exchanges the token for a cookie, which scripts of other pages can neither read nor have sent. The
-cookie is made of the token (HMAC): it is good as long as the token is, whatever process serves the page. To
-change the tokens, delete the file.
+A browser exchanges the token for a cookie, which scripts of other pages can neither read nor make it send.
+The cookie is derived from the token (HMAC), so that it is valid as long as the token is, whichever process
+serves the page. To change the tokens, delete the file.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ _MOST_BYTES = 4096
 
 @dataclass(frozen=True, slots=True, repr=False)
 class Tokens:
-    """By role."""
+    """One token per role."""
 
     operator: str
     viewer: str
@@ -42,61 +42,64 @@ class Tokens:
         return self._find(cookie, self.cookie)
 
     def cookie(self, role: Role) -> str:
-        """What a browser gets for the token."""
+        """Return the cookie that a browser gets for the token."""
         return hmac.new(self._of(role).encode(), f"session {role}".encode(), hashlib.sha256).hexdigest()
 
     def _of(self, role: Role) -> str:
         return self.operator if role == "operator" else self.viewer
 
     def _find(self, given: str, right: object) -> Role | None:
-        """In constant time for each role."""
+        """Return the role whose secret is ``given``, compared in constant time."""
         found: Role | None = None
-        for role in ROLES:  # both, whichever fits; as bytes, since text that is not ASCII is refused
+        # Both roles are compared, even after a match. As bytes, since str must be ASCII for compare_digest.
+        for role in ROLES:
             if hmac.compare_digest(given.encode(), right(role).encode()):  # type: ignore[operator]
                 found = role
         return found
 
 
 def load_tokens(path: Path) -> Tokens:
-    """The tokens in ``path``, made where there is no file. Raises UsageError where others may read it."""
-    # Its owner's alone from the first moment, and never written over: O_EXCL does not follow a link either.
+    """Read the tokens from ``path``, or create it. Raises UsageError if others may read it."""
+    # Only the owner can ever read the file, and O_EXCL neither overwrites an existing one nor follows a link.
     try:
         file = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o600)
     except FileExistsError:
-        return _read(path)
+        return _read_tokens(path)
     except OSError as error:
         raise UsageError(
-            f"the file of tokens {path} cannot be opened: {error.strerror}", hint="web.token_file"
+            f"the token file {path} cannot be opened: {error.strerror}", hint="web.token_file"
         ) from error
-    made = {role: secrets.token_urlsafe(_TOKEN_BYTES) for role in ROLES}
+    created = {role: secrets.token_urlsafe(_TOKEN_BYTES) for role in ROLES}
     with os.fdopen(file, "w") as out:
-        json.dump(made, out)
-    return Tokens(**made)
+        json.dump(created, out)
+    return Tokens(**created)
 
 
-def _read(path: Path) -> Tokens:
-    odd = UsageError(f"the file of tokens {path} is not one of ours", hint="delete it: a new one is made")
+def _read_tokens(path: Path) -> Tokens:
+    invalid = UsageError(
+        f"the token file {path} is not valid", hint="delete it, and a new one will be created"
+    )
     try:
         file = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK)
     except OSError as error:
         raise UsageError(
-            f"the file of tokens {path} cannot be opened: {error.strerror}", hint="web.token_file"
+            f"the token file {path} cannot be opened: {error.strerror}", hint="web.token_file"
         ) from error
     with os.fdopen(file, "rb") as source:
-        found = os.fstat(file)
-        if not stat.S_ISREG(found.st_mode):
-            raise odd
-        if found.st_uid != os.geteuid() or stat.S_IMODE(found.st_mode) & 0o077:
+        status = os.fstat(file)
+        if not stat.S_ISREG(status.st_mode):
+            raise invalid
+        if status.st_uid != os.geteuid() or stat.S_IMODE(status.st_mode) & 0o077:
             raise UsageError(
-                f"the file of tokens {path} can be read by others (mode {stat.S_IMODE(found.st_mode):04o})",
-                hint=f"delete it: a new one is made; or chmod 600 {path}, if nobody has read it",
+                f"the token file {path} can be read by others (mode {stat.S_IMODE(status.st_mode):04o})",
+                hint=f"delete it, and a new one will be created; or chmod 600 {path}, if nobody has read it",
             )
         content = source.read(_MOST_BYTES)
     try:
         table = json.loads(content)
         tokens = Tokens(str(table["operator"]), str(table["viewer"]))
     except (ValueError, KeyError, TypeError) as error:
-        raise odd from error
+        raise invalid from error
     if min(len(tokens.operator), len(tokens.viewer)) < _TOKEN_BYTES or tokens.operator == tokens.viewer:
-        raise odd
+        raise invalid
     return tokens

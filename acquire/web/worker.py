@@ -1,7 +1,8 @@
-"""``python -m acquire.web.worker COMMAND …``: a command of ours that stands back for everything else.
+"""``python -m acquire.web.worker COMMAND …``: run an `acquire` command at the lowest priority.
 
-It gets what the processors leave, is the first to go where memory is short, and ends with who started it; a
-step of a calibration is asked to, since it has an instrument to leave as it was.
+It gets only idle processor time, is the first to be killed when memory is short, and ends with the process
+that started it. A calibration step is interrupted rather than killed, so that it can leave the instrument as
+it was.
 """
 
 from __future__ import annotations
@@ -19,9 +20,9 @@ _PR_SET_PDEATHSIG = 1
 
 def main() -> None:
     stand_back(_NICE, FIRST)
-    last = signal.SIGINT if sys.argv[1] == "calibrate" else signal.SIGKILL
-    ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, last, 0, 0, 0)
-    os.execv(sys.executable, [sys.executable, "-m", "acquire", *sys.argv[1:]])  # noqa: S606 - ours
+    final_signal = signal.SIGINT if sys.argv[1] == "calibrate" else signal.SIGKILL
+    ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, final_signal, 0, 0, 0)
+    os.execv(sys.executable, [sys.executable, "-m", "acquire", *sys.argv[1:]])  # noqa: S606 - ourselves
 
 
 if __name__ == "__main__":

@@ -180,7 +180,7 @@ def test_both_arms_from_one_camera_are_eq1(tmp_path: Path, rig: str) -> None:
 def test_arms_that_cannot_share_a_camera_are_refused() -> None:
     compact = {"cameras.layout": "compact", "cameras.b.serial": "SIM-A"}
     for changes, words in (
-        ({"cameras.layout": "compact"}, "both arms need its serial"),
+        ({"cameras.layout": "compact"}, "both arms need the same serial"),
         (compact | {"cameras.b.first_column": 63}, "overlap in columns 63 to 63"),
     ):
         with pytest.raises(ConfigError, match=words):

@@ -1,4 +1,4 @@
-"""What a host sustains is measured with the real capture path, and nothing of the measurement stays."""
+"""A host's capacity is measured with the real capture path, and the measurement leaves nothing behind."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def test_parts_are_measured_where_it_is_recorded(tmp_path: Path) -> None:
         measure_parts(SMALL, tmp_path / "absent")
 
 
-def test_what_a_killed_measurement_left_is_removed(tmp_path: Path) -> None:
+def test_the_remains_of_a_killed_measurement_are_removed(tmp_path: Path) -> None:
     (tmp_path / ".capacity-4194305.zarr" / "a").mkdir(parents=True)  # above the largest process number
     measure_parts(SMALL, tmp_path)
     assert not any(tmp_path.iterdir())
@@ -54,7 +54,7 @@ def test_processors_are_shared_by_all_parts() -> None:
     assert parts.limit == "processors"
 
 
-def test_a_load_is_what_a_rig_says() -> None:
+def test_a_load_is_derived_from_a_rig() -> None:
     rig = load_rig("rig-demo", {"simulation.speed": 2.0})
     load = Load.of(rig)
     assert (load.pixels, load.dtype, load.codec) == (64, "uint16", "lz4")

@@ -245,9 +245,9 @@ def test_a_client_of_nobody_says_so(tmp_path: Path, monkeypatch: pytest.MonkeyPa
         next(Client(tmp_path / "none.sock").events())
     assert "none.sock" in repr(Client(str(tmp_path / "none.sock")))
     for wrong in ("http://", "http://host:x", "http://host/path"):
-        with pytest.raises(UsageError, match="no address of acquire"):
+        with pytest.raises(UsageError, match="is not a valid address"):
             Client(wrong)
-    with pytest.raises(NoDaemonError, match="nobody answers"):
+    with pytest.raises(NoDaemonError, match="no page answers"):
         Client("http://127.0.0.1:9").status()
 
 

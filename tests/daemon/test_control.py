@@ -176,16 +176,19 @@ def test_daemon_that_does_not_answer(path: Path, monkeypatch: pytest.MonkeyPatch
     with socket.socket(socket.AF_UNIX) as listener:
         listener.bind(str(deaf))
         listener.listen(1)
-        with Client(deaf) as client, pytest.raises(NoDaemonError, match=r"no answer to status within 0\.2 s"):
+        with (
+            Client(deaf) as client,
+            pytest.raises(NoDaemonError, match=r"did not answer status within 0\.2 s"),
+        ):
             client.status()
 
 
 @pytest.mark.parametrize(
     ("answer", "told"),
     [
-        (b"", "went away"),
-        (b"HTTP/1.1 200 OK\r\nContent-Length: 2\r\n\r\n", "went away"),
-        (b"HTTP/1.1 200 OK\r\nContent-Length: 200\r\n\r\n{}", "went away"),
+        (b"", "closed the connection"),
+        (b"HTTP/1.1 200 OK\r\nContent-Length: 2\r\n\r\n", "closed the connection"),
+        (b"HTTP/1.1 200 OK\r\nContent-Length: 200\r\n\r\n{}", "closed the connection"),
         (b"HTTP/1.1 200 OK\r\nContent-Length: 2\r\n\r\n{}", "another version"),
     ],
 )

@@ -231,7 +231,7 @@ def test_a_client_waits_for_a_daemon_that_is_starting(path: Path, monkeypatch: p
         starting.kill()
         with pytest.raises(NoDaemonError):
             waiting.result()
-    assert "one is starting" in said[0]
+    assert "which is starting" in said[0]
     assert not may_listen(process, path)
 
 

@@ -251,8 +251,8 @@ def test_a_journal_that_cannot_be_read_is_told(place: Place, caplog: pytest.LogC
     [
         ("/mnt/archive", "not a URL; possible: s3://bucket/prefix"),
         ("s3://", "not a URL"),
-        ("s3://key:secret@bucket/x", "come from the environment"),
-        ("s3://bucket/x?versionId=1", "come from the environment"),
+        ("s3://key:secret@bucket/x", "must come from the environment"),
+        ("s3://bucket/x?versionId=1", "must come from the environment"),
         ("gopher://x/y", "gopher"),
     ],
 )

@@ -204,7 +204,7 @@ def test_what_cannot_be_is_refused_in_words(daemon: Daemon, engine: RunEngine, t
         assert client.status().state is State.IDLE
         client.arm()
         client.start(tmp_path / "somebody.zarr")
-        assert "is recording for somebody else" in in_words(engine, fly(recorder, None))
+        assert "is recording for another user" in in_words(engine, fly(recorder, None))
         assert client.status().state is State.RECORDING
     absent = Recorder(tmp_path / "nobody.sock", name="absent")
     with pytest.raises(NotConnectedError, match=r"nobody\.sock"), init_devices():

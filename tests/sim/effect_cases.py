@@ -1,4 +1,4 @@
-"""Effects with parameters that show, and what a small bench makes of them."""
+"""Effects with noticeable parameters, and their results on a small bench."""
 
 from __future__ import annotations
 

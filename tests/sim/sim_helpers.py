@@ -1,4 +1,4 @@
-"""What the simulation's tests share; children of spawned processes live here, apart from pytest."""
+"""Helpers of the simulation's tests; main functions of spawned processes are here, apart from pytest."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ LEDS = LedSceneConfig(
 
 @dataclass
 class ManualClock:
-    """Time that moves by what is slept, and by ``step_ns`` at every look; ``on_sleep`` sees each nap."""
+    """A clock that advances by each sleep, and by ``step_ns`` per reading; sleeping calls ``on_sleep``."""
 
     now_ns: int = 1_000_000_000
     utc_offset_ns: int = 1_700_000_000_000_000_000
@@ -121,7 +121,7 @@ def naive_lines(scene: Scene, code: Code, stages: int, substeps: int, arm: str, 
 
 
 def read_lines(camera: Camera, lines: int, timeout_s: float = 300.0) -> list[np.ndarray]:
-    """Blocks until ``lines`` lines have come."""
+    """Return blocks until ``lines`` lines have come."""
     blocks, have = [], 0
     while have < lines:
         block = camera.next_block(timeout_s)

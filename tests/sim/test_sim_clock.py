@@ -43,7 +43,7 @@ def test_pulses_keep_pace_with_the_clock_times_the_speed(wire, clock, speed):
         assert wire.read().issued == int(simulated_lines) + 1
 
 
-def test_a_line_period_of_no_whole_nanosecond_does_not_drift(wire, clock):
+def test_a_fractional_line_period_does_not_drift(wire, clock):
     train = wire.start(Fraction(10**9, 600_000), Fraction(1), CODE_ATTRS)  # 600 kHz: 1666.66… ns
     clock.now_ns = train.start_ns + 3600 * 10**9
     assert wire.read().issued == 3600 * 600_000 + 1
@@ -91,7 +91,7 @@ def test_stop_keeps_the_count_and_is_idempotent(wire, clock):
 
 def test_a_train_cannot_start_while_another_runs_but_after_it(wire, clock):
     first = wire.start(LINE_PERIOD_NS, Fraction(1), CODE_ATTRS)
-    with pytest.raises(DeviceError, match="train 1 still runs"):
+    with pytest.raises(DeviceError, match="train 1 is still running"):
         wire.start(LINE_PERIOD_NS, Fraction(1), CODE_ATTRS)
     wire.stop()
     second = wire.start(LINE_PERIOD_NS, Fraction(2), {"kind": "constant", "value": 1})
@@ -115,7 +115,7 @@ def test_wait_is_bounded_with_and_without_a_train(wire, clock):
     assert clock.now_ns - begin_ns == pytest.approx(0.25e9, rel=1e-3)
 
 
-def test_wait_sees_a_start_and_a_stop_that_come_meanwhile(wire, clock):
+def test_wait_notices_a_start_and_a_stop(wire, clock):
     clock.on_sleep = lambda: wire.read().train or wire.start(LINE_PERIOD_NS, Fraction(1), CODE_ATTRS)
     assert wire.wait(1, 5, timeout_s=1.0).issued == 5
     clock.on_sleep = wire.stop
@@ -125,13 +125,13 @@ def test_wait_sees_a_start_and_a_stop_that_come_meanwhile(wire, clock):
 
 
 def test_a_code_that_does_not_fit_is_refused_and_leaves_the_wire_whole(wire):
-    with pytest.raises(UsageError, match="on the wire"):
+    with pytest.raises(UsageError, match="too long for the wire"):
         wire.start(LINE_PERIOD_NS, Fraction(1), {"kind": "x" * 5000})
     assert wire.read().train is None
 
 
 @pytest.mark.parametrize("place", [0, clock_module._PAYLOAD_AT + 3])
-def test_a_torn_record_is_never_believed(wire, monkeypatch, place):
+def test_a_torn_record_is_never_accepted(wire, monkeypatch, place):
     """A writer that died half-way: its sequence is odd, or the bytes do not match their checksum."""
     monkeypatch.setattr(clock_module, "_TORN_S", 0.02)
     wire.start(LINE_PERIOD_NS, Fraction(1), CODE_ATTRS)
@@ -141,7 +141,7 @@ def test_a_torn_record_is_never_believed(wire, monkeypatch, place):
         wire.read()
 
 
-def test_a_stop_between_two_steps_of_a_look_is_noticed(wire, clock):
+def test_a_stop_in_the_middle_of_a_reading_is_noticed(wire, clock):
     """The reader holds the running train, then the writer stops it, then time passes: the stop counts."""
     late = ManualClock()
     reader = Wire.__new__(Wire)
@@ -191,7 +191,7 @@ def test_a_wire_goes_to_spawned_children_only(wire):
         pickle.dumps(wire)
 
 
-def test_a_closed_or_forgotten_wire_leaves_no_descriptor():
+def test_a_closed_or_collected_wire_leaves_no_descriptor():
     wire = Wire()
     descriptor = wire._descriptor
     wire.close()

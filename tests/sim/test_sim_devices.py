@@ -1,4 +1,4 @@
-"""Simulated cameras at the end of a wire: on a clock that is told to move, and in processes of their own."""
+"""Simulated cameras at the end of a wire, with a manual clock and in separate processes."""
 
 from __future__ import annotations
 
@@ -145,7 +145,7 @@ def test_code_and_timing_come_with_the_pulses(wire, clock, trigger):
     np.testing.assert_array_equal(dn, expected_dn("a", 40, ConstantCode(1), substep_s=5e-5))
 
 
-def test_a_late_camera_delivers_everything_and_says_how_late_it_is(wire, clock, trigger):
+def test_a_late_camera_delivers_everything_and_reports_how_late_it_is(wire, clock, trigger):
     eye = camera(wire)
     eye.arm()
     trigger.start()
@@ -231,7 +231,7 @@ def received(link):
     return link.recv()
 
 
-def test_two_cameras_in_processes_of_their_own_follow_one_trigger():
+def test_two_cameras_in_separate_processes_follow_one_trigger():
     wire = Wire()
     trigger = TriggerDriver(lambda: TwinTransport(TriggerModel(wire, 90_000_000)), TriggerConfig())
     openers = [SimulatedCameraOpener(wire, optics(arm), camera_config(), 64, LINE_RATE_HZ) for arm in "ab"]

@@ -1,4 +1,4 @@
-"""Effects on the image, against their formulas: what a lens, a splitter and the air make of one lit pixel."""
+"""Effects on the image against their formulas, for a single lit pixel."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ def test_misregistration_shifts_by_fractions_of_a_pixel_and_turns():
     assert other.stages == ()
 
 
-def test_an_image_may_be_larger_and_the_scene_go_on_beyond_the_field():
+def test_an_image_may_be_magnified_and_the_scene_extend_beyond_the_field():
     point = np.zeros((1, N, N), np.float32)
     point[0, 4, 12] = 1  # 7.5 above the middle, half a pixel to the right
     (stage,) = (
@@ -85,7 +85,7 @@ def test_an_image_may_be_larger_and_the_scene_go_on_beyond_the_field():
 
 
 @pytest.mark.parametrize("part", [0.06, -0.06])
-def test_a_lens_shows_the_middle_of_a_side_too_far_out_or_in(part):
+def test_a_lens_displaces_the_middle_of_a_side_outwards_or_inwards(part):
     half, middle = N / 2, (N - 1) / 2
     scene = np.zeros((1, N, N), np.float32)
     scene[0, 11:13, 20] = 1  # 8.5 to the right of the middle
@@ -97,7 +97,7 @@ def test_a_lens_shows_the_middle_of_a_side_too_far_out_or_in(part):
     assert bench(flat(listed=effects("lens_distortion", arm="a"))).camera("b", LIT).stages == ()
 
 
-def test_vignetting_takes_its_part_at_the_corners():
+def test_vignetting_removes_its_fraction_at_the_corners():
     (stage,) = bench(flat(listed=effects("vignetting", loss=0.3))).camera("a", LIT).stages
     left = stage.run(np.ones((1, N, N), np.float32))[0]
     corner = ((N - 1) / 2) ** 2 / (N / 2) ** 2
@@ -137,7 +137,7 @@ def test_images_of_masks_and_of_frames_agree():
     assert np.abs(masks - frames).max() <= 1
 
 
-def test_the_point_spread_of_arm_b_may_be_another():
+def test_arm_b_may_have_its_own_point_spread():
     listed = effects("psf", sigma_b_pixels=2.0)
     a, b = (bench(flat(listed=listed)).camera(arm, LIT).stages[0] for arm in ("a", "b"))
     point = np.zeros((1, N, N), np.float32)

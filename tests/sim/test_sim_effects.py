@@ -67,7 +67,7 @@ def test_lines_of_all_effects_together_do_not_depend_on_how_they_are_read(layout
     np.testing.assert_array_equal(later.missing, whole.missing[800:1100])
 
 
-def test_one_effect_more_leaves_the_draws_of_the_others():
+def test_another_effect_leaves_the_draws_of_the_others_unchanged():
     alone = electrons(flat(0.0, effects("read_noise"))) - electrons(flat(0.0))
     with_offset = electrons(flat(0.0, effects("dsnu", "read_noise")))
     offset = electrons(flat(0.0, effects("dsnu")))
@@ -134,7 +134,7 @@ def test_prnu_and_dsnu_are_fixed_patterns_of_their_size():
     assert np.ptp(lines, axis=0).max() == 0 < np.ptp(lines[0])
 
 
-def test_a_full_well_holds_no_more():
+def test_a_full_well_limits_the_electrons():
     assert electrons(flat(1.0, effects("full_well"))).max() == pytest.approx(600.0)
     np.testing.assert_array_equal(read(flat(0.1, effects("full_well"))).pixels, read(flat(0.1)).pixels)
 
@@ -150,7 +150,7 @@ def test_column_offsets_repeat_by_channel():
     assert np.std(many) == pytest.approx(4.0, rel=0.15)
 
 
-def test_an_adc_of_fewer_bits_has_fewer_levels_and_an_end():
+def test_an_adc_with_fewer_bits_has_fewer_levels_and_saturates():
     ramp = read(blinking(effects("adc", bits=12)), code=CODE).pixels
     assert set(np.unique(ramp % 16)) == {0}
     exact = read(blinking(), code=CODE).pixels.astype(int)
@@ -234,7 +234,7 @@ def test_jitter_has_its_histogram_and_moves_light_between_neighbours():
     assert moved.std() > 0.05
 
 
-def test_a_late_light_is_shared_with_the_sub_steps_after_and_the_trigger_takes_it_back():
+def test_late_light_is_shared_with_the_next_sub_steps_and_the_trigger_compensates_it():
     late = flat(listed=effects("delays", light_s=1.4 * DT, a_s=0.0, b_s=0.3 * DT))
     plain = read(flat(), code=CODE)
     for arm, delay in (("a", 1.4), ("b", 1.1)):
@@ -266,7 +266,7 @@ def test_light_in_part_of_a_sub_step():
         expected = 300.0 + 0.4 * S * shared.sum(axis=(1, 2))
         np.testing.assert_allclose(seen, np.broadcast_to(expected[:, None], seen.shape), atol=0.51)
     for kind in ("led_rise_fall", "trigger_jitter"):
-        with pytest.raises(UsageError, match=f"{kind} cannot be simulated with a light"):
+        with pytest.raises(UsageError, match=f"effect {kind!r} cannot be simulated with light"):
             replace(bench(flat(listed=effects(kind))), lit_part=(0.0, 0.5)).camera("a", CODE)
 
 
@@ -303,7 +303,7 @@ def test_drift_moves_offset_and_gain_hour_by_hour():
     assert later.mean() == pytest.approx(309.0 + 1.03 * FLAT, abs=1.01)
 
 
-def test_a_bent_converter_is_right_at_both_ends():
+def test_a_bowed_converter_is_right_at_both_ends():
     listed, white = effects("adc_nonlinearity", bow=0.03), 65535 - 300
     for level, part in ((0.0, 0.0), (0.5, 0.5 * FLAT * 60 / white)):
         straight = 300 + part * white
@@ -347,7 +347,7 @@ def test_the_tail_of_charge_transfer():
 # Stream
 
 
-def test_lines_drop_at_their_rate_and_are_told():
+def test_lines_are_dropped_at_their_rate_and_reported():
     lines = read(blinking(effects("dropped_lines")), 20_000, CODE)
     assert lines.missing.mean() == pytest.approx(0.02, rel=0.15)
     assert (lines.pixels[lines.missing] == 0).all()

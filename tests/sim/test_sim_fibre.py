@@ -81,10 +81,10 @@ def test_lines_do_not_depend_on_how_they_are_read():
     np.testing.assert_array_equal(np.concatenate(parts), whole)
 
 
-def test_a_scene_with_a_layout_of_its_own_is_refused():
+def test_a_scene_with_its_own_optics_is_refused():
     for optics in ({"layout": "compact"}, {"a": {"turn_deg": 90}}):
         with pytest.raises(
-            UsageError, match=r"the scene has optics of its own, .* possible: a scene without"
+            UsageError, match=r"the scene has \[optics\] of its own, .* possible: a scene without"
         ):
             read(flat(optics=optics), "a", 0, 1)
 

@@ -91,10 +91,10 @@ def test_the_eight_orientations(integers, turn, mirror, separable):
     np.testing.assert_allclose(lines, expected, atol=0.51)
 
 
-def test_layouts_that_cannot_be_are_refused(integers):
+def test_impossible_layouts_are_refused(integers):
     for optics, words in (
         ({"layout": "compact", "sensor_pixels": 10}, "on 10 columns"),
-        ({"layout": "compact", "column_b": 4}, "beside each other"),
+        ({"layout": "compact", "column_b": 4}, "side by side"),
         ({"layout": "emulated", "raw_bits": 14}, "Mono16"),
         ({"layout": "interline"}, "substeps = 1"),
     ):

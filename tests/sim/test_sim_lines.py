@@ -1,4 +1,4 @@
-"""Streaming lines against Eq. (1) term by term, both arms, both ways, however the stream is split."""
+"""Streaming lines against Eq. (1) term by term, for both arms, both methods, and any split of the stream."""
 
 from __future__ import annotations
 
@@ -107,7 +107,7 @@ def test_a_constant_scene_gives_every_exposed_term():
     np.testing.assert_array_equal(Y, np.full((7, M), M * S * S * S))
 
 
-def test_a_scene_is_asked_for_bounded_stretches_only_and_not_in_the_dark():
+def test_a_scene_is_sampled_in_bounded_ranges_and_not_in_the_dark():
     scene = array_scene(16, 3)
     asked = []
 

@@ -1,4 +1,4 @@
-"""Files and functions of the user as scenes: any size and rate, and clear words for what is none."""
+"""The user's files and functions as scenes, of any size and rate, and clear errors for invalid ones."""
 
 from __future__ import annotations
 
@@ -119,19 +119,19 @@ def bad_files(tmp_path):
         ("complex.npy", "complex"),
         ("rateless.npy", "frame rate"),
         ("noise.mp4", "neither a picture nor a video"),
-        ("cut.npy", "no array"),
-        ("objects.npy", "no array"),
+        ("cut.npy", "not an array"),
+        ("objects.npy", "not an array"),
         ("cut.png", "cut.png"),
-        ("missing.mp4", "no such file"),
+        ("missing.mp4", "does not exist"),
     ],
 )
-def test_what_is_no_scene_is_refused_when_it_is_opened(tmp_path, name, words):
+def test_invalid_files_are_refused_when_they_are_opened(tmp_path, name, words):
     bad_files(tmp_path)
     with pytest.raises(UsageError, match="(?s)" + words):
         shown(tmp_path / name)
 
 
-def test_a_function_of_the_user_in_a_file_beside_the_scene(tmp_path):
+def test_a_users_function_in_a_file_next_to_the_scene(tmp_path):
     (tmp_path / "wave.py").write_text(
         "import numpy as np\n"
         "def wave(t, row, column):\n    return 0.5 + 0.5 * np.sin(6*row + 0*column + 1e3*t[:,None,None])\n"
@@ -149,7 +149,7 @@ def test_a_function_of_the_user_in_a_file_beside_the_scene(tmp_path):
             build_scene(load_scene(scene_file), 5, 1e-4)
 
 
-def test_a_picture_of_the_user_swims(tmp_path):
+def test_a_users_picture_moves(tmp_path):
     Image.fromarray(np.full((20, 20, 2), 255, np.uint8), "LA").save(tmp_path / "fish.png")
     sprite = SpriteConfig(picture=str(tmp_path / "fish.png"), row=0.5, column=0.25, size=0.4)
     scene = build_scene(SpritesSceneConfig(kind="sprites", sprites=(sprite,)), 50, 1e-3)
@@ -158,7 +158,7 @@ def test_a_picture_of_the_user_swims(tmp_path):
     np.testing.assert_allclose(np.argwhere(frame > 0.5).mean(axis=0) + 0.5, (25, 12.5), atol=0.6)
 
 
-def test_a_container_that_breaks_off_ends_with_its_last_frame(tmp_path):
+def test_a_truncated_container_ends_with_its_last_frame(tmp_path):
     noise = RNG.integers(0, 255, (40, 64, 64)).astype(np.uint8)
     write_container(tmp_path / "late.mkv", noise, 25, "ffv1")
     whole = (tmp_path / "late.mkv").read_bytes()

@@ -170,7 +170,10 @@ def test_scenes_add_up_and_stay_separable_where_they_can():
         ('kind = "usaf"\ndrive = { waveform = "pulse", frequency_hz = nan }', "finite"),
         ('kind = "stars"', "scene 'stars' is not known"),
         ('kind = "usaf"\n[[effects]]\nkind = "read_noise"\nsigma_e = -2.0', "sigma_e = -2.0"),
-        ('kind = "usaf"\n[[effects]]\nkind = "shot_noise"\n[[effects]]\nkind = "shot_noise"', "listed once"),
+        (
+            'kind = "usaf"\n[[effects]]\nkind = "shot_noise"\n[[effects]]\nkind = "shot_noise"',
+            "listed only once",
+        ),
         ('kind = "usaf"\ncolour = 3', "unknown key; allowed here: dark"),
         ('kind = "sum"\n[[parts]]\nkind = "usaf"\noptics = { layout = "compact" }', "belong to the sum"),
     ],

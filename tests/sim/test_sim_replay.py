@@ -124,7 +124,7 @@ def test_a_camera_that_is_not_armed_or_armed_late_says_so(stored):
         with pytest.raises(CameraError, match="not armed"):
             camera.next_block(0.0)
         wire.start(Fraction(30_000), Fraction(1), CODE.to_attrs())
-        with pytest.raises(CameraError, match="trigger runs"):
+        with pytest.raises(CameraError, match="trigger is running"):
             camera.arm()
     finally:
         wire.close()

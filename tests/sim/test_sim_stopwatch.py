@@ -22,7 +22,7 @@ def at(monkeypatch):
     return spend
 
 
-def test_a_caller_does_not_pay_for_what_it_calls(at):
+def test_a_caller_is_not_charged_for_its_callees(at):
     watch = Stopwatch()
     inner = watch.timed("inner", lambda: at(5.0))
 
@@ -40,7 +40,7 @@ def test_a_caller_does_not_pay_for_what_it_calls(at):
     assert (watch.seconds["outer"], watch.seconds["broken"]) == (4.0, 0.0)
 
 
-def test_of_light_the_series_take_the_time(at):
+def test_the_series_of_light_are_timed(at):
     watch = Stopwatch()
 
     def series(first, count):

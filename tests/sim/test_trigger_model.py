@@ -1,4 +1,4 @@
-"""The behavioural model by itself: frame by frame, on a clock that is told to move."""
+"""The behavioural model on its own, frame by frame, with a manual clock."""
 
 from __future__ import annotations
 
@@ -102,7 +102,7 @@ def test_nothing_is_lit_or_pulsed_before_a_start(bench) -> None:
     assert tag.flags == TagFlag.LAST | TagFlag.NO_LINES
 
 
-def test_a_budget_ends_the_run_whoever_looks_and_when(bench) -> None:
+def test_a_budget_ends_the_run_whenever_it_is_read(bench) -> None:
     bench.run(LINE_BUDGET=100, TAG_INTERVAL=40)
     bench.clock.now_ns += 10**12
     assert bench.status()["end_reason"] == EndReason.LINE_BUDGET
@@ -116,7 +116,7 @@ def test_a_budget_ends_the_run_whoever_looks_and_when(bench) -> None:
     assert bench.wire.read().issued == 100
 
 
-def test_a_second_is_latched_and_told_in_a_run(bench) -> None:
+def test_a_second_is_latched_and_tagged_in_a_run(bench) -> None:
     bench.model.pps_edge()
     assert bench.status()["pps_seen"]
     bench.run()
@@ -142,7 +142,7 @@ def test_a_lost_clock_ends_the_run_and_forbids_the_next(bench) -> None:
     bench.command(Command.ARM, 6)
 
 
-def test_a_silent_host_is_waited_for_so_long_and_no_longer(bench) -> None:
+def test_the_watchdog_ends_the_run_of_a_silent_host_in_time(bench) -> None:
     bench.run(WATCHDOG=10 * 2700)
     for _ in range(5):
         bench.clock.now_ns += 9 * LINE_NS
@@ -156,7 +156,7 @@ def test_a_silent_host_is_waited_for_so_long_and_no_longer(bench) -> None:
     assert bench.tags[-1].flags == TagFlag.LAST | TagFlag.WATCHDOG
 
 
-def test_tags_without_room_are_counted_and_the_next_one_says_so(bench, monkeypatch) -> None:
+def test_tags_without_room_are_counted_and_the_next_one_is_flagged(bench, monkeypatch) -> None:
     monkeypatch.setattr(trigger_model, "TAG_ROOM", 4)
     bench.run(TAG_INTERVAL=1)
     bench.clock.now_ns += 9 * LINE_NS
@@ -181,7 +181,7 @@ def test_tags_without_room_are_counted_and_the_next_one_says_so(bench, monkeypat
         (FrameType.WRITE, write_payload(r.STATUS.address, [0]), 1, ErrorCode.READ_ONLY),
     ],
 )
-def test_what_cannot_be_done_is_refused_by_name(bench, kind, payload, version, error) -> None:
+def test_invalid_requests_are_refused_with_their_error_code(bench, kind, payload, version, error) -> None:
     answer = bench.ask(kind, payload, version=version)
     assert (answer.type, answer.version) == (FrameType.NAK, r.PROTOCOL_VERSION)
     assert parse_nak(answer.payload)[0] == error

@@ -1,4 +1,4 @@
-"""A browser, where there is one: Debian's chromium without a window, driven by playwright."""
+"""A browser, if one is installed: Debian's headless chromium, driven by playwright."""
 
 from __future__ import annotations
 

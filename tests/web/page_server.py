@@ -1,4 +1,4 @@
-"""The page's process, as the daemon starts it, for a daemon of the test's."""
+"""The page's process, as the daemon starts it, for a test's own daemon."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The first hour on the page, in a real browser: dark, flat, target, a sweep of delays that is cancelled."""
+"""Calibration on the page in a real browser: dark, flat, target, and a cancelled sweep of delays."""
 
 from __future__ import annotations
 
@@ -86,12 +86,12 @@ def test_dark_flat_target_and_a_sweep_that_is_cancelled(
     daemon, put = bench
     cal = daemon.home / "cal.zarr"
     with aiming(browser, daemon, "viewer") as page:
-        page.locator("#why-dark", has_text="looking only").wait_for(timeout=SEEN_MS)
+        page.locator("#why-dark", has_text="logged in as a viewer").wait_for(timeout=SEEN_MS)
         assert page.locator("#steps button:enabled").count() == 0
         answer = page.request.post(f"{address_in(daemon.log)}api/calibration", data={"step": "dark"})
         assert answer.status == 403
     with aiming(browser, daemon, "operator") as page:
-        page.locator("#why-flat", has_text="After the step Dark").wait_for(timeout=SEEN_MS)
+        page.locator("#why-flat", has_text="The step Dark must be done first").wait_for(timeout=SEEN_MS)
         fits(page, "aim-before")
         measure(page, "dark", 8)  # fewer than are any use: the browser asks for more
         assert not page.evaluate("document.getElementById('lines-dark').validity.valid")
@@ -111,7 +111,7 @@ def test_dark_flat_target_and_a_sweep_that_is_cancelled(
         measure(page, "delay", 1024)
         second = daemon.home / "calibration-recordings" / "delay-2.zarr"
         until(second.exists)
-        page.locator("#why-dark", has_text="The step Delay is under way").wait_for(timeout=SEEN_MS)
+        page.locator("#why-dark", has_text="The step Delay is running").wait_for(timeout=SEEN_MS)
         assert page.evaluate("document.activeElement.id") == "cancel-delay"
         fits(page, "aim-sweeping")
         page.keyboard.press("Enter")
@@ -123,7 +123,7 @@ def test_dark_flat_target_and_a_sweep_that_is_cancelled(
         with daemon.client() as client:
             client.arm()
             client.start(daemon.home / "run.zarr", lines=2**31)
-            page.locator("#why-dark", has_text="is recorded").wait_for(timeout=SEEN_MS)
+            page.locator("#why-dark", has_text="is recording").wait_for(timeout=SEEN_MS)
             client.stop()
             client.wait(SEALED, timeout_s=120)
         page.wait_for_selector("#begin-dark:enabled", timeout=SEEN_MS)

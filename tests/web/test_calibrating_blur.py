@@ -1,4 +1,4 @@
-"""The optics' blur on the page, in a real browser: told where no edges are, found where there are some."""
+"""The optics' blur on the page in a real browser: an error without edges, a finding with them."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def test_blur_is_a_button_like_the_others(browser: Browser, tmp_path: Path) -> N
     rig = (*SETTINGS, scene, f"calibration='{tmp_path}/cal.zarr'", "web.port=0")
     with contextlib.closing(Daemon(tmp_path, *rig)) as daemon:
         with aiming(browser, daemon, "viewer") as page:
-            page.locator("#why-psf", has_text="looking only").wait_for(timeout=SEEN_MS)
+            page.locator("#why-psf", has_text="logged in as a viewer").wait_for(timeout=SEEN_MS)
         with aiming(browser, daemon, "operator") as page:
             page.locator("#step-psf", has_text="Put a square or a checkerboard in").wait_for(timeout=SEEN_MS)
             assert page.locator("#begin-psf").inner_text() == "Measure blur"

@@ -1,4 +1,4 @@
-"""Few rows stand for many lines: their extremes, in the trigger's numbering, whatever the blocks were."""
+"""A few rows show the extremes of many lines, by the trigger's count, for any division into blocks."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ def test_rows_are_the_extremes_of_their_lines_however_they_are_cut_into_blocks(
 
 
 @pytest.mark.parametrize(("lost", "kind"), [(True, LOST), (False, UNSEEN)])
-def test_a_gap_is_shown_as_rows_that_say_what_it_is(lost: bool, kind: int) -> None:
+def test_a_gap_is_shown_as_rows_of_its_kind(lost: bool, kind: int) -> None:
     decimator = Decimator(Scale(4, 1, WHITE), 8)
     put(decimator, 0, lines(0, 8))
     put(decimator, 20, lines(20, 12), lost=lost)
@@ -91,7 +91,7 @@ def test_many_pixels_become_few_columns_without_losing_an_extreme() -> None:
     assert rows.high[0, :-1].max() == 0
 
 
-def test_the_histogram_counts_what_was_looked_at() -> None:
+def test_the_histogram_counts_sampled_pixels() -> None:
     decimator = Decimator(Scale(2, 2, WHITE), 8)
     pixels = np.full((8, 8), WHITE, np.uint16)
     pixels[:, 0] = 0
@@ -102,7 +102,7 @@ def test_the_histogram_counts_what_was_looked_at() -> None:
 
 
 @pytest.mark.parametrize(("rate_hz", "line_bytes"), [(1000.0, 128), (33_333.0, 128), (1e5, 4640), (6e5, 54)])
-def test_what_is_looked_at_is_bounded(rate_hz: float, line_bytes: int) -> None:
+def test_the_rate_of_sampled_pixels_is_bounded(rate_hz: float, line_bytes: int) -> None:
     scale = Scale.of(rate_hz, line_bytes, 255)
     assert rate_hz / scale.step <= 1000
     looked_at = rate_hz / scale.stride * line_bytes

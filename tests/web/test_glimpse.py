@@ -1,4 +1,4 @@
-"""A glimpse is made of the lines that have just passed, cut as a recording would cut them."""
+"""A glimpse is made of the latest lines, which are cut as from a recording."""
 
 from __future__ import annotations
 

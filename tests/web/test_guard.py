@@ -1,4 +1,4 @@
-"""Who may do what: by name, origin, token, role and rate; and nothing outside the recordings' directory."""
+"""Access by host name, origin, token, role and rate; nothing outside the recordings' directory is served."""
 
 from __future__ import annotations
 
@@ -118,15 +118,15 @@ def test_tokens_are_made_once_for_their_owner_alone(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("content", ["", "{}", "[]", json.dumps({"operator": "x", "viewer": "y"}), "\0"])
-def test_a_file_that_is_none_of_ours_is_refused(tmp_path: Path, content: str) -> None:
+def test_an_invalid_token_file_is_refused(tmp_path: Path, content: str) -> None:
     path = tmp_path / "tokens"
     path.write_text(content)
     path.chmod(0o600)
-    with pytest.raises(UsageError, match="not one of ours"):
+    with pytest.raises(UsageError, match="is not valid"):
         load_tokens(path)
 
 
-def test_tokens_that_others_can_read_are_none(tmp_path: Path) -> None:
+def test_tokens_that_others_can_read_are_refused(tmp_path: Path) -> None:
     path = tmp_path / "tokens"
     load_tokens(path)
     path.chmod(0o640)
@@ -142,12 +142,12 @@ def test_tokens_that_others_can_read_are_none(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("settings", "words"),
     [
-        ({"host": "0.0.0.0"}, "can be reached from elsewhere"),
-        ({"certificate": "c.pem"}, "belong together"),
+        ({"host": "0.0.0.0"}, "can be reached from other hosts"),
+        ({"certificate": "c.pem"}, "must be given together"),
         ({"port": 99999}, "less than or equal to 65535"),
     ],
 )
-def test_the_page_is_closed_to_strangers_unless_said(settings: dict[str, Any], words: str) -> None:
+def test_the_page_is_closed_to_other_hosts_by_default(settings: dict[str, Any], words: str) -> None:
     with pytest.raises(ConfigError, match=words):
         load_rig("rig-demo", {f"web.{key}": value for key, value in settings.items()})
 

@@ -1,4 +1,4 @@
-"""A take on a real daemon, in a real browser: armed, recorded, marked, stopped, cut, reconstructed, shown."""
+"""A recording with a real daemon in a real browser, from arming to the reconstructed video."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The page's process ends while somebody follows it, and somebody else stands in the middle of a request."""
+"""The page's process ends while one client follows its stream and another is in the middle of a request."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from page_server import PageServer
 
 
 @pytest.mark.parametrize("reads", [True, False])
-def test_nobody_who_is_under_way_is_answered_with_a_failure(tmp_path: Path, reads: bool) -> None:
+def test_pending_requests_do_not_fail_when_the_page_ends(tmp_path: Path, reads: bool) -> None:
     server = PageServer(tmp_path / "c.sock", tmp_path)
     place = urlsplit(server.address)
     head = f"Host: {place.netloc}\r\nAuthorization: Bearer {server.operator}\r\n"

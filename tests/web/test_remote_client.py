@@ -1,4 +1,4 @@
-"""The same clients by the page's address: with a token, over TLS, and refused without."""
+"""The same clients at the page's address, with a token and over TLS, and refused without."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ def page(tmp_path: Path) -> Iterator[PageServer]:
         yield made
 
 
-def test_scripts_steer_from_elsewhere_as_from_here(
+def test_scripts_can_control_the_instrument_remotely(
     page: PageServer, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     address = page.address.rstrip("/")
@@ -74,7 +74,7 @@ def test_scripts_steer_from_elsewhere_as_from_here(
     assert "from elsewhere" in [news.text for news in client.events(history=True, timeout_s=0)]
     with pytest.raises(StateError, match="cannot stop while armed"):
         client.stop()
-    with pytest.raises(UsageError, match="for looking only"):
+    with pytest.raises(UsageError, match="a viewer's token cannot change anything"):
         Client(address, token=page.viewer).disarm()
     with pytest.raises(UsageError, match="missing or wrong"):
         Client(address).status()

@@ -146,12 +146,12 @@ STATES: dict[str, tuple[Callable[[Instrument], None], str, str, str]] = {
     "lost": (lose, "lost", "lines lost", "246 lines were lost"),
     "faulted": (fail, "fault", "fault", "camera b does not answer"),
     "disk nearly full": (fill_disk, "degraded", "degraded", "the disk is full in 4 min"),
-    "stale": (go_silent, "", "no news", "has no daemon"),
+    "stale": (go_silent, "", "no contact", "cannot reach the daemon"),
 }
 
 
 @pytest.mark.parametrize("name", STATES)
-def test_every_state_is_told_in_words_and_fits(name: str, page: Page, instrument: Instrument) -> None:
+def test_every_state_is_shown_in_words_and_fits(name: str, page: Page, instrument: Instrument) -> None:
     enter, level, word, sentence = STATES[name]
     enter(instrument)
     wanted = f"[data-level={level}]" if level else "[data-stale]"
@@ -217,9 +217,7 @@ def test_keys_work_on_every_screen(page: Page, instrument: Instrument) -> None:
     page.keyboard.up("s")
 
 
-def test_a_clock_that_is_wrong_on_the_viewers_side_is_not_believed(
-    browser: Browser, instrument: Instrument
-) -> None:
+def test_a_wrong_clock_of_the_viewer_has_no_influence(browser: Browser, instrument: Instrument) -> None:
     with contextlib.closing(browser.new_context()) as context:
         context.add_init_script("const now = Date.now; Date.now = () => now() - 10800000;")
         page = context.new_page()
@@ -229,7 +227,7 @@ def test_a_clock_that_is_wrong_on_the_viewers_side_is_not_believed(
         assert re.fullmatch(r"for [\d.]+ (s|min)", told), told
 
 
-def test_who_works_by_key_keeps_the_place_in_a_list_that_changes(page: Page, instrument: Instrument) -> None:
+def test_keyboard_focus_stays_in_place_when_a_list_changes(page: Page, instrument: Instrument) -> None:
     page.keyboard.press("4")
     page.focus("#measure")
     page.evaluate("window.held = document.activeElement")
@@ -238,10 +236,8 @@ def test_who_works_by_key_keeps_the_place_in_a_list_that_changes(page: Page, ins
     assert page.evaluate("document.activeElement.id") == "measure"
 
 
-def test_a_connection_of_which_only_one_end_is_left_is_made_anew(
-    browser: Browser, instrument: Instrument
-) -> None:
-    """As after a night in which the viewer's computer slept: nobody tells it that the connection is gone."""
+def test_a_half_open_connection_is_replaced(browser: Browser, instrument: Instrument) -> None:
+    """As after the viewer's computer has slept: it is not notified that the connection is gone."""
     with (
         contextlib.closing(Wire(instrument.server.address)) as wire,
         contextlib.closing(browser.new_context()) as context,
@@ -254,7 +250,7 @@ def test_a_connection_of_which_only_one_end_is_left_is_made_anew(
         page.wait_for_selector("body:not([data-stale]) #arm:enabled", timeout=SEEN_MS)
 
 
-def test_everything_has_a_name_for_who_cannot_see_it(page: Page) -> None:
+def test_every_element_has_an_accessible_name(page: Page) -> None:
     unnamed = page.evaluate(
         """[...document.querySelectorAll("button, input, select, a, canvas, section, dialog")].filter((one) =>
            !(one.getAttribute("aria-label") || one.getAttribute("aria-labelledby") ||
@@ -265,15 +261,15 @@ def test_everything_has_a_name_for_who_cannot_see_it(page: Page) -> None:
     assert page.get_attribute("#told", "aria-live") == "polite"
 
 
-def test_what_is_refused_is_told_in_the_daemons_words(page: Page, instrument: Instrument) -> None:
+def test_a_refusal_is_shown_with_the_daemons_message(page: Page, instrument: Instrument) -> None:
     instrument.run.refuse["arm"] = CameraError("camera b is not plugged in", hint="plug it in")
     page.keyboard.press("a")
     page.locator("#error", has_text="camera b is not plugged in").wait_for(timeout=SEEN_MS)
     assert "try: plug it in" in page.inner_text("#error")
 
 
-def test_a_key_that_does_nothing_says_why(browser: Browser, instrument: Instrument) -> None:
-    """Before the page knows anything, in another state, while the daemon is busy, and without a daemon."""
+def test_a_key_without_effect_is_explained(browser: Browser, instrument: Instrument) -> None:
+    """Before the page is connected, in another state, while the daemon is busy, and without a daemon."""
     error = "#error:not([hidden])"
     with contextlib.closing(browser.new_context()) as context:
         page = context.new_page()
@@ -298,11 +294,13 @@ def test_a_key_that_does_nothing_says_why(browser: Browser, instrument: Instrume
         instrument.close()
         page.wait_for_selector("body[data-stale]", timeout=SEEN_MS)
         page.keyboard.press("s")
-        page.locator(error, has_text="cannot stop: The page's server has no daemon").wait_for(timeout=SEEN_MS)
+        page.locator(error, has_text="cannot stop: The page's server cannot reach the daemon").wait_for(
+            timeout=SEEN_MS
+        )
     assert instrument.run.names == ["arm"]
 
 
-def test_a_viewer_looks_and_a_stranger_is_asked(browser: Browser, instrument: Instrument) -> None:
+def test_a_viewer_may_look_and_a_stranger_must_log_in(browser: Browser, instrument: Instrument) -> None:
     with contextlib.closing(browser.new_context()) as context:
         page = context.new_page()
         page.goto(instrument.server.address)
@@ -316,18 +314,18 @@ def test_a_viewer_looks_and_a_stranger_is_asked(browser: Browser, instrument: In
         page.wait_for_selector("body[data-state=idle]", timeout=SEEN_MS)
         assert page.is_disabled("#arm")
         page.keyboard.press("a")
-        page.locator("#error", has_text="looking only").wait_for(timeout=SEEN_MS)
+        page.locator("#error", has_text="logged in as a viewer").wait_for(timeout=SEEN_MS)
         assert instrument.server.viewer not in page.url
         (cookie,) = context.cookies()
         assert (cookie["httpOnly"], cookie["sameSite"]) == (True, "Strict")
         assert instrument.server.viewer not in str(cookie)
     log = instrument.server.log.read_text()
-    assert "enters from 127.0.0.1" in log
+    assert "logged in from 127.0.0.1" in log
     assert instrument.server.viewer not in log
 
 
-def test_who_has_entered_is_not_asked_again(browser: Browser, instrument: Instrument) -> None:
-    """The answer to a question from before the token comes after it."""
+def test_a_logged_in_user_is_not_asked_again(browser: Browser, instrument: Instrument) -> None:
+    """The answer to a request from before the log-in arrives after it."""
     with contextlib.closing(browser.new_context()) as context:
         page = context.new_page()
         held: list[Route] = []

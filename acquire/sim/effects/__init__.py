@@ -1,6 +1,6 @@
-"""Effects: what a real instrument adds to Eq. (1), each a small pure stage that is there only when listed.
+"""Effects: what a real instrument adds to Eq. (1), as small pure stages that exist only if listed.
 
-Stages run in the order of the physics, whatever the order of the list; ours::
+Stages run in the order of the physics, whatever the order of the list. The built-in effects::
 
     light    code_errors ▸ pwm ▸ led_nonlinearity ▸ led_rise_fall ▸ delays ▸ trigger_jitter   sub-steps' light
     image    misregistration ▸ lens_distortion ▸ vignetting ▸ psf ▸ stray_light (veil) ▸ fibre_bands ▸
@@ -10,10 +10,10 @@ Stages run in the order of the physics, whatever the order of the list; ours::
     readout  drift ▸ column_offsets ▸ adc_nonlinearity ▸ adc                          DN
     stream   dropped_lines ▸ duplicated_lines                                           lines as delivered
 
-An effect is one class, parameters and stages together, that an entry point names (`acquire.plugins`): it is
-imported when a scene lists it. Every effect draws from streams of its own (`acquire.sim.effects.base.draws`),
-per arm and tile of lines: adding one leaves the draws of the others as they were, and nothing depends on how
-the stream is split into calls.
+An effect is one class, with its parameters and stages, that an entry point names (`acquire.plugins`). It is
+imported when a scene lists it. Every effect draws from its own random streams, one per arm and tile of lines
+(`acquire.sim.effects.base.draws`), so that adding an effect leaves the draws of the others unchanged and
+results do not depend on how the stream is split into calls.
 """
 
 from __future__ import annotations
@@ -28,21 +28,21 @@ if TYPE_CHECKING:
 
 
 def in_order(effects: Iterable[Any]) -> list[Any]:
-    """Effect configurations in the order in which they act."""
-    return sorted(effects, key=_when)
+    """Return effect configurations in the order in which they act."""
+    return sorted(effects, key=_order)
 
 
 def kinds() -> list[str]:
-    """Every effect that is installed and works, in the order in which they act. Imports them all."""
-    return sorted(EFFECTS.working(), key=lambda kind: _when(EFFECTS.load(kind), kind))
+    """Return every effect that is installed and can be imported, in the order in which they act."""
+    return sorted(EFFECTS.working(), key=lambda kind: _order(EFFECTS.load(kind), kind))
 
 
-def _when(effect: Effect | type[Effect], kind: str = "") -> tuple[int, float, str]:
+def _order(effect: Effect | type[Effect], kind: str = "") -> tuple[int, float, str]:
     return PLACES.index(effect.place), effect.rank, kind or effect.kind
 
 
 def build_stages(effects: Iterable[Any], setting: Setting) -> list[Stage]:
-    """The stages of the listed effects on one arm, in the order in which they act. None listed: none."""
+    """Return the stages of the listed effects on one arm, in the order in which they act."""
     stages = [stage for effect in in_order(effects) for stage in effect.stages(setting)]
     return sorted(stages, key=lambda stage: PLACES.index(stage.place))
 

@@ -1,4 +1,4 @@
-"""What every effect is given, what it gives back, and where its random numbers come from."""
+"""The interface of effects: their setting, their stages and their random streams."""
 
 from __future__ import annotations
 
@@ -18,28 +18,28 @@ if TYPE_CHECKING:
 
 Place = Literal["light", "image", "signal", "charge", "readout", "stream"]
 PLACES: tuple[Place, ...] = get_args(Place)
-"""Where in the chain a stage acts, in the order of the light's and the signal's way."""
+"""Places in the chain where a stage can act, in the order in which light and signal pass them."""
 
 TILE_LINES = 256
-"""Random numbers of lines are drawn for tiles of so many, at fixed places."""
+"""Random numbers are drawn for tiles of this many lines, at fixed positions."""
 
 
 @dataclass(frozen=True, slots=True)
 class Setting:
-    """What a stage may depend on besides its own parameters.
+    """Everything that a stage may depend on, apart from its own parameters.
 
     Attributes
     ----------
     arm : "a", "b", or "ab" for the one sensor of the compact layout
-    seed, realisation : of the random streams; temporal noise of another realisation is independent,
-        fixed patterns stay
+    seed, realisation : select the random streams; temporal noise is independent between realisations,
+        fixed patterns are the same
     stages, substeps, pixels : M and S of the sensor; pixels per line
     substep_s : duration of a sub-step
-    scene : what it looks at
-    white_dn, black_level_dn, responsivity_dn, gain_dn_per_e : of its camera
-    settled_s : by which the trigger starts the charge's moves after the light's, on purpose
-    lit_part : from where to where of a lit sub-step the trigger lets the light on
-    fibre : what stands before the sensor and lays a larger scene out in bands; None: nothing does
+    scene : the scene before the sensor
+    white_dn, black_level_dn, responsivity_dn, gain_dn_per_e : properties of the camera
+    settled_s : time by which the trigger deliberately starts the charge transfers after the light
+    lit_part : begin and end of the light within a lit sub-step, as fractions of it
+    fibre : the fibre that lays a larger scene out on the sensor in bands; None: no fibre
     """
 
     arm: str
@@ -60,17 +60,17 @@ class Setting:
 
     @property
     def exposure_s(self) -> float:
-        """t_exp of a line: M line periods."""
+        """Exposure time t_exp of a line: M line periods."""
         return self.stages * self.substeps * self.substep_s
 
 
 @dataclass(frozen=True, slots=True)
 class Stage:
-    """One step. ``run`` is a pure function; what it takes and gives depends on the place::
+    """One step. ``run`` is a pure function whose arguments and result depend on the place::
 
     light     Illumination → Illumination (wraps it)
     image     frames (k, n, n) → frames
-    signal    lines (m, pixels), of which the first ``lead`` are only history, first line → lines
+    signal    lines (m, pixels), of which the first ``lead`` are history only, first line → lines
     charge    electrons (256, pixels) float64, first line → electrons
     readout   DN (256, pixels) float64, first line → DN
     stream    pixels (256, pixels), first line, the line before → pixels, missing (256,) or None
@@ -83,10 +83,10 @@ class Stage:
 
 
 class Effect(EffectConfig, ABC):
-    """An effect: a model of its parameters, and the stages that these make. Named by an entry point.
+    """An effect: the model of its parameters, which builds its stages. Named by an entry point.
 
-    ``place`` is where it acts first, ``rank`` when within that place: lower ranks act first. Ours are 10, 20
-    and so on; what says nothing acts after them.
+    ``place`` is where it acts first; ``rank`` orders the effects of one place, lowest first. The built-in
+    effects have ranks 10, 20 and so on; an effect without a rank acts after them.
     """
 
     place: ClassVar[Place]
@@ -94,17 +94,17 @@ class Effect(EffectConfig, ABC):
 
     @abstractmethod
     def stages(self, setting: Setting) -> list[Stage]:
-        """What it does to one arm; empty where it does nothing there. Equal settings give equal stages."""
+        """Return its stages for one arm, none if it does not act there. Equal settings give equal stages."""
 
 
 def draws(effect: str, setting: Setting, tile: int, *, arm: str | None = None) -> np.random.Generator:
-    """The random stream of one effect, arm and tile; realisations of temporal noise differ."""
+    """Return the random stream of one effect, arm and tile; it differs between realisations."""
     key = (*_name_key(effect, arm or setting.arm), setting.realisation, 1, tile & 0xFFFFFFFF, tile < 0)
     return np.random.Generator(np.random.PCG64(np.random.SeedSequence(setting.seed, spawn_key=key)))
 
 
 def pattern(effect: str, setting: Setting) -> np.random.Generator:
-    """The random stream of one effect's fixed pattern on one arm: the same for every line and realisation."""
+    """Return the random stream of an effect's fixed pattern on one arm, the same in every realisation."""
     key = (*_name_key(effect, setting.arm), 0)
     return np.random.Generator(np.random.PCG64(np.random.SeedSequence(setting.seed, spawn_key=key)))
 

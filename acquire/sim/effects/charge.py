@@ -1,4 +1,4 @@
-"""Effects in the pixel, counted in electrons (EMVA 1288 release 4.0, Linear, ch. 2: μ_e, σ_e, K)."""
+"""Effects in the pixel, in electrons (EMVA 1288 release 4.0, Linear, ch. 2: μ_e, σ_e, K)."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ class Prnu(Effect):
     kind: Literal["prnu"]
     place: ClassVar[Place] = "charge"
     rank: ClassVar[float] = 10
-    prnu: Positive = Field(le=1, description="PRNU₁₂₈₈ as a part of 1")
+    prnu: Positive = Field(le=1, description="PRNU₁₂₈₈ as a fraction of 1")
 
     def stages(self, setting: Setting) -> list[Stage]:
         """μ_e ← μ_e·(1 + N(0, PRNU₁₂₈₈)), fixed per pixel of the line: TDI averages over the stages."""
@@ -88,7 +88,7 @@ class Dsnu(Effect):
 
 
 class ColumnDefects(Effect):
-    """Columns that are hot (electrons that nothing lit) or dead (none), at places drawn by the seed."""
+    """Hot columns (electrons without light) and dead columns (no electrons), at positions from the seed."""
 
     kind: Literal["column_defects"]
     place: ClassVar[Place] = "charge"
@@ -100,8 +100,9 @@ class ColumnDefects(Effect):
     dead: int = Field(default=0, ge=0, le=2**16, description="columns of each arm")
 
     def stages(self, setting: Setting) -> list[Stage]:
-        """Hot columns: + Poisson(hot_e). Dead columns: μ_e ← 0. Which ones is drawn once; a column is one of
-        either. With more than there are columns, all are hot, and what is left over is forgotten.
+        """Hot columns: + Poisson(hot_e). Dead columns: μ_e ← 0. The columns are drawn once, and none is both.
+
+        If more are requested than there are columns, hot ones come first and the excess is ignored.
         """
         order = pattern("column_defects", setting).permutation(setting.pixels)
         hot, dead = order[: self.hot], order[self.hot : self.hot + self.dead]
@@ -117,7 +118,7 @@ class ColumnDefects(Effect):
 
 
 class FullWell(Effect):
-    """No more than the saturation capacity fits into a pixel."""
+    """A pixel holds at most its saturation capacity."""
 
     kind: Literal["full_well"]
     place: ClassVar[Place] = "charge"
@@ -125,7 +126,7 @@ class FullWell(Effect):
     capacity_e: Positive = Field(description="μ_e.sat")
 
     def stages(self, setting: Setting) -> list[Stage]:  # noqa: ARG002
-        """No more than μ_e.sat electrons."""
+        """μ_e ← min(μ_e, μ_e.sat)."""
 
         def run(electrons: NDArray[Any], first_line: int) -> NDArray[Any]:  # noqa: ARG001
             held: NDArray[Any] = np.minimum(electrons, self.capacity_e)

@@ -1,7 +1,7 @@
-"""Effects of an image-transmitting fibre: how bright its fibres are, and how well its bands are laid.
+"""Effects of an image-transmitting fibre: the transmission of its fibres, and the alignment of its bands.
 
-Every pixel of the scene is seen by one fibre of either arm, so both are maps of the scene's image on that
-arm. Where a rig has no fibre, the field is a single band.
+Every pixel of the scene is imaged by one fibre of each arm, so both effects are maps of the scene's image on
+that arm. Without a fibre in the rig the field is a single band.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 
 class FibreBands(Effect):
-    """Each band of the fibre begins a little beside its place: what its end shows of the scene is shifted."""
+    """Each band of the fibre is slightly displaced, which shifts its part of the scene."""
 
     kind: Literal["fibre_bands"]
     place: ClassVar[Place] = "image"
@@ -28,8 +28,9 @@ class FibreBands(Effect):
     shift_pixels: float = Field(gt=0, le=16, description="standard deviation along either axis, fine pixels")
 
     def stages(self, setting: Setting) -> list[Stage]:
-        """X(r, c) ← X(r − Δr, c − Δc) within each band, bilinear, with Δr, Δc ~ N(0, shift_pixels) fixed per
-        arm and band; what is beyond the square that is drawn is as at its edge.
+        """X(r, c) ← X(r − Δr, c − Δc) within each band, bilinear, with Δr, Δc ~ N(0, shift_pixels).
+
+        The shifts are fixed per arm and band. Beyond the simulated square, the values at its edge continue.
         """
         from scipy.ndimage import shift
 
@@ -38,19 +39,20 @@ class FibreBands(Effect):
         axis = 1 if setting.arm == "a" else 2
 
         def run(frames: NDArray[np.float32]) -> NDArray[np.float32]:
-            moved = frames.copy()
-            for (begin, end), off in zip(edges, drawn, strict=True):
-                margin = ceil(abs(off[axis - 1])) + 1
+            shifted = frames.copy()
+            for (begin, end), offset in zip(edges, drawn, strict=True):
+                # The band with enough of its neighbourhood for the shift.
+                margin = ceil(abs(offset[axis - 1])) + 1
                 low, high = max(0, begin - margin), min(side, end + margin)
-                part = shift(_band(frames, axis, low, high), (0, *off), order=1, mode="nearest")
-                _band(moved, axis, begin, end)[:] = _band(part, axis, begin - low, end - low)
-            return moved
+                part = shift(_band(frames, axis, low, high), (0, *offset), order=1, mode="nearest")
+                _band(shifted, axis, begin, end)[:] = _band(part, axis, begin - low, end - low)
+            return shifted
 
         return [Stage("fibre_bands", "image", run)]
 
 
 class FibreGain(Effect):
-    """Fibres pass different parts of the light: those that end on one column alike, and each by itself."""
+    """Fibres transmit different fractions of the light: a gain per column, and one per fibre."""
 
     kind: Literal["fibre_gain"]
     place: ClassVar[Place] = "image"
@@ -59,22 +61,24 @@ class FibreGain(Effect):
         default=0.0, description="standard deviation of the gain of all fibres that end on a column"
     )
     fibres: Part = Field(
-        default=0.0, description="of single ones; what moves down a column averages over as many as it has"
+        default=0.0,
+        description="standard deviation of the gain of single fibres; a line averages over all on its column",
     )
 
     def stages(self, setting: Setting) -> list[Stage]:
-        """X ← X·max(0, 1 + N(0, columns)[band, along] + N(0, fibres)[r, c]), fixed per arm. `along` is where
-        the column lies on its band: the scene's column on arm A, its row on arm B.
+        """X ← X·max(0, 1 + N(0, columns)[band, along] + N(0, fibres)[r, c]), fixed per arm.
+
+        ``along`` is the position along the band: the scene's column on arm A, its row on arm B.
         """
         side, edges = setting.scene.size, _edges(setting)
         drawn = pattern("fibre_gain", setting)
         along_a, gain = setting.arm == "a", np.ones((side, side), np.float32)
         for begin, end in edges:
-            of_column = (self.columns * drawn.standard_normal(side)).astype(np.float32)
+            column_gain = (self.columns * drawn.standard_normal(side)).astype(np.float32)
             if along_a:
-                gain[begin:end] += of_column
+                gain[begin:end] += column_gain
             else:
-                gain[:, begin:end] += of_column[:, None]
+                gain[:, begin:end] += column_gain[:, None]
         gain += self.fibres * drawn.standard_normal((side, side)).astype(np.float32)
         np.maximum(gain, 0, out=gain)
 
@@ -86,7 +90,7 @@ class FibreGain(Effect):
 
 
 def _edges(setting: Setting) -> list[tuple[int, int]]:
-    """First row (arm A) or column (B) of each band in the square that is drawn, and the one after it."""
+    """Return first and end row (arm A) or column (arm B) of each band in the simulated square."""
     fibre, side = setting.fibre, setting.scene.size
     if fibre is None:
         return [(0, side)]
@@ -96,5 +100,5 @@ def _edges(setting: Setting) -> list[tuple[int, int]]:
 
 
 def _band(frames: NDArray[np.float32], axis: int, begin: int, end: int) -> NDArray[np.float32]:
-    """A view of frames (t, r, c) from row or column ``begin`` to ``end``."""
+    """Return a view of frames (t, r, c) from row or column ``begin`` to ``end``."""
     return frames[:, begin:end] if axis == 1 else frames[:, :, begin:end]

@@ -1,7 +1,7 @@
-"""Effects of the optics: what the image on the sensor is of the scene.
+"""Effects of the optics on the image of the scene.
 
-They are linear and do not change with time, so a separable scene pays once for its masks, any other
-for every frame.
+They are linear and constant in time, so a separable scene is mapped once, by its masks, and any other scene
+frame by frame.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 
 class Misregistration(Effect):
-    """The image of one arm lies off by fractions of a fine pixel (bilinear), is turned, or is larger."""
+    """The image of one arm is shifted by fractions of a fine pixel, rotated or magnified (bilinear)."""
 
     kind: Literal["misregistration"]
     place: ClassVar[Place] = "image"
@@ -31,48 +31,50 @@ class Misregistration(Effect):
     turn_deg: float = Field(default=0.0, ge=-45, le=45, description="counter-clockwise about the centre")
     magnification: float = Field(default=1.0, ge=0.5, le=2, description="about the centre")
     beyond: Literal["dark", "edge"] = Field(
-        default="dark", description="what lies beyond the field: nothing, or what is at its edge"
+        default="dark", description="light from beyond the field: none, or the values at its edge"
     )
 
     def stages(self, setting: Setting) -> list[Stage]:
-        """The image of ``arm`` magnified and turned about its middle, then shifted, bilinear; from outside
-        comes in what is ``beyond``. The map is that of `acquire.alignment.Alignment`.
+        """Magnify and rotate the image of ``arm`` about its centre, then shift it, bilinear.
+
+        ``beyond`` supplies the light from outside the field. The map is that of
+        `acquire.alignment.Alignment`.
         """
         if setting.arm != self.arm:
             return []
         from scipy.ndimage import affine_transform
 
         alignment = Alignment(self.rows, self.columns, self.turn_deg, self.magnification)
-        back = np.linalg.inv(alignment.matrix)
-        # not "constant", which makes a pixel that reaches over the edge by a hundredth wholly dark
+        inverse = np.linalg.inv(alignment.matrix)
+        # Not "constant", with which a pixel that extends beyond the edge by a hundredth is entirely dark.
         mode: Literal["nearest", "grid-constant"] = "nearest" if self.beyond == "edge" else "grid-constant"
-        middle = np.full(2, (setting.scene.size - 1) / 2)
-        offset = middle - back @ (middle + np.array([self.rows, self.columns]))
+        centre = np.full(2, (setting.scene.size - 1) / 2)
+        offset = centre - inverse @ (centre + np.array([self.rows, self.columns]))
 
         def run(frames: NDArray[np.float32]) -> NDArray[np.float32]:
-            moved = np.empty_like(frames)
-            for frame, out in zip(frames, moved, strict=True):
-                affine_transform(frame, back, offset, output=out, order=1, mode=mode)
-            return moved
+            displaced = np.empty_like(frames)
+            for frame, out in zip(frames, displaced, strict=True):
+                affine_transform(frame, inverse, offset, output=out, order=1, mode=mode)
+            return displaced
 
         return [Stage("misregistration", "image", run)]
 
 
 class PointSpread(Effect):
-    """A Gaussian point spread function, of both arms or each its own."""
+    """A Gaussian point spread function, the same for both arms or one for each."""
 
     kind: Literal["psf"]
     place: ClassVar[Place] = "image"
     rank: ClassVar[float] = 40
     sigma_pixels: Positive = Field(description="standard deviation in fine pixels")
-    sigma_b_pixels: Positive | None = Field(default=None, description="that of arm B; absent: the same")
+    sigma_b_pixels: Positive | None = Field(default=None, description="for arm B; absent: sigma_pixels")
 
     def stages(self, setting: Setting) -> list[Stage]:
-        """Convolution with a normalised Gaussian of σ fine pixels, cut off at 4σ; light may leave."""
+        """Convolve with a normalised Gaussian of σ fine pixels, cut off at 4σ; light may leave the field."""
         from scipy.ndimage import gaussian_filter1d
 
-        of_b = self.sigma_b_pixels if setting.arm == "b" else None
-        sigma = self.sigma_pixels if of_b is None else of_b
+        sigma_b = self.sigma_b_pixels if setting.arm == "b" else None
+        sigma = self.sigma_pixels if sigma_b is None else sigma_b
 
         def run(frames: NDArray[np.float32]) -> NDArray[np.float32]:
             along = gaussian_filter1d(frames, sigma, axis=1, mode="constant")
@@ -83,13 +85,13 @@ class PointSpread(Effect):
 
 
 class StrayLight(Effect):
-    """Light where none belongs: a veil made of the scene's own, and steady light that no code switches."""
+    """Stray light: a veil of the scene's own light, and steady ambient light that no code switches."""
 
     kind: Literal["stray_light"]
     place: ClassVar[Place] = "image"
     rank: ClassVar[float] = 50
-    veil: Part = Field(default=0.0, description="part of the scene's light that is spread evenly")
-    ambient: float = Field(default=0.0, ge=0, description="in units of the scene's light")
+    veil: Part = Field(default=0.0, description="fraction of the scene's light that is spread evenly")
+    ambient: float = Field(default=0.0, ge=0, description="ambient light in units of the scene's light")
 
     def stages(self, setting: Setting) -> list[Stage]:
         """Veil v: X ← (1 − v)·X + v·mean(X). Ambient light a: Y ← Y + a·n·S², in every line, coded or not."""

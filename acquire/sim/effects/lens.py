@@ -1,4 +1,4 @@
-"""Effects of an arm's lens. They are linear and do not change with time, as those of `image`."""
+"""Effects of an arm's lens. They are linear and constant in time, like those of `image`."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 
 class LensDistortion(Effect):
-    """The lens of one arm, or of both, is not true: radial, of the third order, bilinear."""
+    """Radial distortion of third order by the lens of one arm, or of both (bilinear)."""
 
     kind: Literal["lens_distortion"]
     place: ClassVar[Place] = "image"
@@ -24,24 +24,26 @@ class LensDistortion(Effect):
     part: float = Field(
         ge=-0.2,
         le=0.2,
-        description="of half the field, by which the middle of a side is seen too far out; below 0: in",
+        description="outward displacement of the middle of a side, as a fraction of half the field; "
+        "below 0: inward",
     )
 
     def stages(self, setting: Setting) -> list[Stage]:
-        """What is seen at p shows the scene at p·(1 − k·|p/h|²), from the middle, with half the side h:
-        radial distortion of the third order (Brown 1966), bilinear; dark beyond the field.
+        """The image at p shows the scene at p·(1 − k·|p/h|²), from the centre, with h half the side.
+
+        This is radial distortion of third order (Brown 1966), bilinear, and dark beyond the field.
         """
         if not _concerns(self.arm, setting):
             return []
         from scipy.ndimage import map_coordinates
 
         half = setting.scene.size / 2
-        middle = (setting.scene.size - 1) / 2
-        seen = np.indices((setting.scene.size,) * 2, np.float64) - middle
-        source = seen * (1 - self.part * (seen**2).sum(axis=0) / half**2) + middle
+        centre = (setting.scene.size - 1) / 2
+        image = np.indices((setting.scene.size,) * 2, np.float64) - centre
+        source = image * (1 - self.part * (image**2).sum(axis=0) / half**2) + centre
 
         def run(frames: NDArray[np.float32]) -> NDArray[np.float32]:
-            # not "constant", which makes a pixel that reaches over the edge by a hundredth wholly dark
+            # Not "constant", with which a pixel that extends beyond the edge by a hundredth is entirely dark.
             return np.stack(
                 [map_coordinates(frame, source, order=1, mode="grid-constant") for frame in frames]
             )
@@ -56,23 +58,27 @@ class Vignetting(Effect):
     place: ClassVar[Place] = "image"
     rank: ClassVar[float] = 30
     arm: Literal["a", "b", "both"] = "both"
-    loss: Part = Field(description="of the light, as far from the axis as a corner is from the middle")
-    rows: float = Field(
-        default=0.0, ge=-1024, le=1024, description="fine pixels of the axis below the middle"
+    loss: Part = Field(
+        description="fraction of light lost at the distance from the axis of a corner from the centre"
     )
-    columns: float = Field(default=0.0, ge=-1024, le=1024, description="fine pixels to its right")
+    rows: float = Field(
+        default=0.0, ge=-1024, le=1024, description="fine pixels from the centre down to the axis"
+    )
+    columns: float = Field(
+        default=0.0, ge=-1024, le=1024, description="fine pixels from the centre to the right to the axis"
+    )
 
     def stages(self, setting: Setting) -> list[Stage]:
-        """X ← X·(1 − v·|p − axis|²/(2·h²)), not below 0: the loss v where |p − axis| is half a diagonal."""
+        """X ← X·(1 − v·|p − axis|²/(2·h²)), not below 0: the loss is v if |p − axis| is half a diagonal."""
         if not _concerns(self.arm, setting):
             return []
-        half, middle = setting.scene.size / 2, (setting.scene.size - 1) / 2
-        rows, columns = np.indices((setting.scene.size,) * 2, np.float64) - middle
-        away = ((rows - self.rows) ** 2 + (columns - self.columns) ** 2) / (2 * half**2)
-        left = np.maximum(1 - self.loss * away, 0).astype(np.float32)
+        half, centre = setting.scene.size / 2, (setting.scene.size - 1) / 2
+        rows, columns = np.indices((setting.scene.size,) * 2, np.float64) - centre
+        distance = ((rows - self.rows) ** 2 + (columns - self.columns) ** 2) / (2 * half**2)
+        transmission = np.maximum(1 - self.loss * distance, 0).astype(np.float32)
 
         def run(frames: NDArray[np.float32]) -> NDArray[np.float32]:
-            dimmed: NDArray[np.float32] = frames * left
+            dimmed: NDArray[np.float32] = frames * transmission
             return dimmed
 
         return [Stage("vignetting", "image", run)]

@@ -1,4 +1,4 @@
-"""Effects of trigger and light sources: how bright each sub-step really is."""
+"""Effects of trigger and light sources on the actual brightness of each sub-step."""
 
 from __future__ import annotations
 
@@ -24,19 +24,19 @@ if TYPE_CHECKING:
 _TILE = 1024
 """Sub-steps whose random numbers are drawn at once."""
 Delay = Annotated[float, Field(ge=0, le=0.01)]
-"""Of a wire, an isolator, a driver (s)."""
-_FORGOTTEN = 40.0
-"""Time constants after which a beginning is forgotten: e⁻⁴⁰ is nothing beside 1 in double precision."""
+"""Delay of a wire, an isolator or a driver (s)."""
+_SETTLED = 40.0
+"""Time constants after which the initial state has no influence: e⁻⁴⁰ is negligible in double precision."""
 
 
 class CodeErrors(Effect):
-    """The light's code differs from the recorded one: bits flipped at random, or all of them late."""
+    """The light's code differs from the recorded one: bits are flipped at random, or all are late."""
 
     kind: Literal["code_errors"]
     place: ClassVar[Place] = "light"
     rank: ClassVar[float] = 10
     flip_rate: Part = Field(default=0.0, description="probability that a bit is wrong")
-    late_substeps: int = Field(default=0, ge=-64, le=64, description="by which the light is late")
+    late_substeps: int = Field(default=0, ge=-64, le=64, description="sub-steps by which the light is late")
 
     def stages(self, setting: Setting) -> list[Stage]:
         """E′(t) = E(t − late), each bit flipped with probability ``flip_rate``; the same for both arms."""
@@ -58,7 +58,7 @@ class CodeErrors(Effect):
 
 
 class Pwm(Effect):
-    """The drivers really switch: duty cycles are held for a period of the carrier."""
+    """Drivers that switch: duty cycles are constant for a period of the carrier."""
 
     kind: Literal["pwm"]
     place: ClassVar[Place] = "light"
@@ -67,10 +67,11 @@ class Pwm(Effect):
     bits: int = Field(default=8, ge=1, le=16, description="resolution of the duty cycle")
 
     def stages(self, setting: Setting) -> list[Stage]:
-        """Drive d becomes full light for round(d·2^bits)/2^bits of every carrier period, from its beginning.
+        """Turn drive d into full light for the first round(d·2^bits)/2^bits of every carrier period.
 
-        A duty cycle is the mean of the drive over the carrier period; a sub-step gets what of the on-times
-        falls into it, exactly. A scene in steady light of one source is not changed: its duty cycle is 1.
+        A duty cycle is the mean of the drive over the carrier period; a sub-step gets exactly the part of the
+        on-times that falls into it. The single steady source of other scenes does not change, because its
+        duty cycle is 1.
         """
         scene, period_s, levels = setting.scene, 1 / self.carrier_hz, 2**self.bits
         periods = setting.substep_s / period_s
@@ -96,7 +97,7 @@ class Pwm(Effect):
 
 
 class LedNonlinearity(Effect):
-    """Light of every LED = a·(1 − exp(−d/a)) for drive d."""
+    """Saturating LEDs: their light is a·(1 − exp(−d/a)) for drive d."""
 
     kind: Literal["led_nonlinearity"]
     place: ClassVar[Place] = "light"
@@ -119,12 +120,12 @@ class LedRiseFall(Effect):
     fall_s: Positive
 
     def stages(self, setting: Setting) -> list[Stage]:
-        """dL/dt = (d − L)/τ with τ = rise where L < d, else fall; a sub-step gets the mean of L, exactly."""
+        """dL/dt = (d − L)/τ with τ = rise if L < d, else fall; a sub-step gets the exact mean of L."""
         _refuse_pulses(self.kind, setting)
-        from acquire.sim.kernels import follow  # compiled code, which reading a scene file does without
+        from acquire.sim.kernels import follow  # compiled code, which is not needed to read a scene file
 
         rise, fall = self.rise_s / setting.substep_s, self.fall_s / setting.substep_s
-        warm_up = ceil(_FORGOTTEN * max(rise, fall))
+        warm_up = ceil(_SETTLED * max(rise, fall))
 
         def lagged(light: Illumination) -> Callable[[int, int], NDArray[Any]]:
             def compute(first: int, count: int) -> NDArray[Any]:
@@ -139,21 +140,21 @@ class LedRiseFall(Effect):
 
 
 class Delays(Effect):
-    """Light and charge come late on their wires, less what the trigger's lead and delays take back."""
+    """Delays of light and charge on their wires, which the trigger's lead and delays compensate in part."""
 
     kind: Literal["delays"]
     place: ClassVar[Place] = "light"
     rank: ClassVar[float] = 45
     light_s: Delay = Field(default=0.0, description="from the trigger's output to the light")
     a_s: Delay = Field(default=0.0, description="from the line trigger to camera A's charge")
-    b_s: Delay = Field(default=0.0, description="to camera B's")
+    b_s: Delay = Field(default=0.0, description="from the line trigger to camera B's charge")
 
     def stages(self, setting: Setting) -> list[Stage]:
-        """The light of a sub-step comes δ sub-steps after the charge: g(t) ← g(t − δ), of two neighbours'.
+        """Delay light by δ sub-steps after the charge: g(t) ← g(t − δ), a mixture of two neighbours.
 
-        δ = (light's delay − camera's − what the trigger leads the light by and delays the line start by) /
-        sub-step; below 0 the light is early. Of one sensor with both images camera A's delays count. A light
-        that is on for a part of a sub-step, from o to c, is shared as [o + δ, c + δ] lies in the two.
+        δ = (delay of the light − delay of the camera − the trigger's lead and line delay) / sub-step; below 0
+        the light is early. On one sensor with both images, camera A's delay applies. Light that is on for
+        part of a sub-step, from o to c, is divided between the two as [o + δ, c + δ] overlaps them.
         """
         camera_s = self.b_s if setting.arm == "b" else self.a_s
         late = (self.light_s - camera_s - setting.settled_s) / setting.substep_s
@@ -161,7 +162,7 @@ class Delays(Effect):
         whole = floor(begin)
         part = max(0.0, end - whole - 1) / (end - begin)
 
-        def moved(light: Illumination) -> Callable[[int, int], NDArray[Any]]:
+        def delayed(light: Illumination) -> Callable[[int, int], NDArray[Any]]:
             def compute(first: int, count: int) -> NDArray[Any]:
                 g = light.light(first - whole - 1, count + 1)
                 shared: NDArray[Any] = (1 - part) * g[:, 1:] + part * g[:, :-1]
@@ -169,11 +170,11 @@ class Delays(Effect):
 
             return compute
 
-        return [_shaped("delays", moved)]
+        return [_shaped("delays", delayed)]
 
 
 class TriggerJitter(Effect):
-    """Charge moves early or late: normal, independent from step to step."""
+    """Charge transfers that are early or late, with a normal distribution, independently of each other."""
 
     kind: Literal["trigger_jitter"]
     place: ClassVar[Place] = "light"
@@ -181,20 +182,20 @@ class TriggerJitter(Effect):
     sigma_s: Positive
 
     def stages(self, setting: Setting) -> list[Stage]:
-        """Step t of the charge comes δ_t ~ N(0, σ) late, in sub-steps, cut off at half of one.
+        """Transfer t is late by δ_t ~ N(0, σ) sub-steps, clipped to half a sub-step.
 
-        Between two steps a row gathers light of its own sub-step, and of a neighbour for as long as it is
-        early or late::
+        Between two transfers a row collects light of its own sub-step, and of a neighbouring one for as long
+        as a transfer is early or late::
 
             g(t) ← max(0, −δ_t)·g(t−1) + (1 − max(0, δ_t) − max(0, −δ_{t+1}))·g(t) + max(0, δ_{t+1})·g(t+1)
         """
         _refuse_pulses(self.kind, setting)
         delay = jitter(self, setting)
 
-        def moved(light: Illumination) -> Callable[[int, int], NDArray[Any]]:
+        def jittered(light: Illumination) -> Callable[[int, int], NDArray[Any]]:
             def compute(first: int, count: int) -> NDArray[Any]:
-                g, step = light.light(first - 1, count + 2), delay(first, count + 1)
-                begin, end = step[:-1], step[1:]
+                g, delays = light.light(first - 1, count + 2), delay(first, count + 1)
+                begin, end = delays[:-1], delays[1:]
                 own = 1 - np.maximum(0, begin) - np.maximum(0, -end)
                 early, late = np.maximum(0, -begin) * g[:, :-2], np.maximum(0, end) * g[:, 2:]
                 gathered: NDArray[Any] = early + own * g[:, 1:-1] + late
@@ -202,11 +203,11 @@ class TriggerJitter(Effect):
 
             return compute
 
-        return [_shaped("trigger_jitter", moved)]
+        return [_shaped("trigger_jitter", jittered)]
 
 
 def jitter(effect: TriggerJitter, setting: Setting) -> Tiled:
-    """δ_t by sub-step, in sub-steps."""
+    """Return the delay δ_t of each transfer, in sub-steps."""
     sigma = effect.sigma_s / setting.substep_s
 
     def compute(first: int, count: int) -> NDArray[Any]:
@@ -217,14 +218,14 @@ def jitter(effect: TriggerJitter, setting: Setting) -> Tiled:
 
 
 def _refuse_pulses(effect: str, setting: Setting) -> None:
-    """UsageError for light in part of a sub-step, of which the effect's formula knows nothing."""
+    """Raise UsageError if the light is on for only part of a sub-step: the formula assumes all of it."""
     if setting.lit_part != (0.0, 1.0):
         raise UsageError(
-            f"effect {effect} cannot be simulated with a light that is on for a part of each sub-step",
-            possible="trigger.light.open_ticks and close_ticks absent; or a scene without the effect",
+            f"effect {effect!r} cannot be simulated with light that is on for only part of each sub-step",
+            possible="a rig without trigger.light.open_ticks and close_ticks; or a scene without the effect",
         )
 
 
 def _shaped(effect: str, shape: Callable[[Illumination], Callable[[int, int], NDArray[Any]]]) -> Stage:
-    """A stage that changes the light alone."""
+    """Return a stage that changes only the light, not bits or drives."""
     return Stage(effect, "light", lambda light: replace(light, light=shape(light)))

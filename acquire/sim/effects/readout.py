@@ -1,4 +1,4 @@
-"""Effects between the pixel and the number, in DN."""
+"""Effects between the pixel and its digital number, in DN."""
 
 from __future__ import annotations
 
@@ -18,31 +18,33 @@ SECONDS_PER_HOUR = 3600.0
 
 
 class Drift(Effect):
-    """Offset and gain move with time, as a camera does that warms up."""
+    """Offset and gain drift with time, as in a camera that warms up."""
 
     kind: Literal["drift"]
     place: ClassVar[Place] = "readout"
     rank: ClassVar[float] = 10
-    hours: float = Field(default=0.0, ge=0, le=1e5, description="since it was as configured, at line 0")
+    hours: float = Field(
+        default=0.0, ge=0, le=1e5, description="age of the drift at line 0: hours since the configured values"
+    )
     offset_dn_per_hour: float = Field(default=0.0, ge=-MOST_DN, le=MOST_DN)
-    gain_per_hour: float = Field(default=0.0, ge=-1, le=1, description="as a part of 1")
+    gain_per_hour: float = Field(default=0.0, ge=-1, le=1, description="as a fraction of the gain")
 
     def stages(self, setting: Setting) -> list[Stage]:
-        """DN ← black + (DN − black)·(1 + g·t) + o·t, t in hours: ``hours`` at line 0, and the lines' time."""
+        """DN ← black + (DN − black)·(1 + g·t) + o·t, with t: ``hours`` plus the hours since line 0."""
         black, line_s = setting.black_level_dn, setting.substeps * setting.substep_s
 
         def run(dn: NDArray[Any], first_line: int) -> NDArray[Any]:
             line = first_line + np.arange(len(dn))[:, None]
             hours = self.hours + line * line_s / SECONDS_PER_HOUR
             gain = 1 + self.gain_per_hour * hours
-            moved: NDArray[Any] = black + (dn - black) * gain + self.offset_dn_per_hour * hours
-            return moved
+            drifted: NDArray[Any] = black + (dn - black) * gain + self.offset_dn_per_hour * hours
+            return drifted
 
         return [Stage("drift", "readout", run)]
 
 
 class ColumnOffsets(Effect):
-    """Every read-out channel adds its own offset."""
+    """Each read-out channel adds its own offset."""
 
     kind: Literal["column_offsets"]
     place: ClassVar[Place] = "readout"
@@ -51,7 +53,7 @@ class ColumnOffsets(Effect):
     channels: int = Field(default=4, ge=1, le=2**16, description="columns c, c + channels … share one")
 
     def stages(self, setting: Setting) -> list[Stage]:
-        """+ N(0, σ) DN, fixed per read-out channel; pixel c is read by channel c modulo their number."""
+        """+ N(0, σ) DN, fixed per read-out channel; pixel c is read by channel c mod ``channels``."""
         channel = self.sigma_dn * pattern("column_offsets", setting).standard_normal(self.channels)
         offset = channel[np.arange(setting.pixels) % self.channels]
 
@@ -62,13 +64,13 @@ class ColumnOffsets(Effect):
 
 
 class AdcNonlinearity(Effect):
-    """A converter whose line bends: right at black and at white, off between."""
+    """A converter with a bowed characteristic: correct at black and at white, wrong in between."""
 
     kind: Literal["adc_nonlinearity"]
     place: ClassVar[Place] = "readout"
     rank: ClassVar[float] = 30
     bow: float = Field(
-        ge=-0.2, le=0.2, description="of the range, by which the middle of it is read too high"
+        ge=-0.2, le=0.2, description="excess in the middle of the range, as a fraction of the range"
     )
 
     def stages(self, setting: Setting) -> list[Stage]:
@@ -84,16 +86,16 @@ class AdcNonlinearity(Effect):
 
 
 class Adc(Effect):
-    """A converter of fewer bits, or one that ends below white."""
+    """A converter with fewer bits, or one that saturates below white."""
 
     kind: Literal["adc"]
     place: ClassVar[Place] = "readout"
     rank: ClassVar[float] = 40
-    bits: int = Field(ge=1, le=16, description="of the range up to white")
+    bits: int = Field(ge=1, le=16, description="bits of the range up to white")
     saturation_dn: float | None = Field(default=None, gt=0)
 
     def stages(self, setting: Setting) -> list[Stage]:
-        """DN in steps of (white + 1)/2^bits, rounded, and no more than ``saturation_dn``."""
+        """Round DN to steps of (white + 1)/2^bits and clip it at ``saturation_dn``."""
         step = max(1.0, (setting.white_dn + 1) / 2**self.bits)
         top = setting.white_dn if self.saturation_dn is None else min(self.saturation_dn, setting.white_dn)
 

@@ -1,4 +1,4 @@
-"""Effects on the way from the camera: lines that do not come, or come twice."""
+"""Effects on the way from the camera: lines that are lost or duplicated."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 
 class DroppedLines(Effect):
-    """Lines that never arrive; the camera's count shows it."""
+    """Lines that never arrive; the camera's line count reveals them."""
 
     kind: Literal["dropped_lines"]
     place: ClassVar[Place] = "stream"
@@ -24,7 +24,7 @@ class DroppedLines(Effect):
     rate: float = Field(gt=0, lt=1, description="probability per line and arm")
 
     def stages(self, setting: Setting) -> list[Stage]:
-        """Every line is lost with probability ``rate``; the camera's count jumps over it."""
+        """Lose every line with probability ``rate``; the camera's line count skips it."""
 
         def run(
             pixels: NDArray[Any],
@@ -38,7 +38,7 @@ class DroppedLines(Effect):
 
 
 class DuplicatedLines(Effect):
-    """Lines that come with the pixels of the line before; nothing shows it."""
+    """Lines that arrive with the pixels of the line before; nothing reveals them."""
 
     kind: Literal["duplicated_lines"]
     place: ClassVar[Place] = "stream"
@@ -46,16 +46,17 @@ class DuplicatedLines(Effect):
     rate: float = Field(gt=0, lt=1, description="probability per line and arm")
 
     def stages(self, setting: Setting) -> list[Stage]:
-        """With probability ``rate`` a line has the pixels of the line that was read out before it."""
+        """With probability ``rate``, replace a line's pixels by those of the line read out before it."""
 
         def run(
             pixels: NDArray[Any], first_line: int, before: Callable[[], NDArray[Any]]
         ) -> tuple[NDArray[Any], None]:
             drawn = draws("duplicated_lines", setting, first_line // TILE_LINES).random(len(pixels))
-            twice = drawn < self.rate
-            if twice.any():
-                shifted = np.concatenate([before() if twice[0] else pixels[:1], pixels[:-1]])
-                pixels = np.where(twice[:, None], shifted, pixels)
+            duplicated = drawn < self.rate
+            if duplicated.any():
+                # ``before`` computes another tile, so it is called only if the first line needs it.
+                shifted = np.concatenate([before() if duplicated[0] else pixels[:1], pixels[:-1]])
+                pixels = np.where(duplicated[:, None], shifted, pixels)
             return pixels, None
 
         return [Stage("duplicated_lines", "stream", run)]

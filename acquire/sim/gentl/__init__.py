@@ -1,1 +1,1 @@
-"""A simulated GenTL producer: cameras for any GenICam program, fed by the forward model."""
+"""A simulated GenTL producer: cameras for any GenICam program, with lines from the forward model."""

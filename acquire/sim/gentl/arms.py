@@ -1,4 +1,4 @@
-"""The simulated cameras of a rig behind our GenTL producer: made when first opened, one bench for all."""
+"""The simulated cameras of a rig behind the GenTL producer: one bench for all, made when first opened."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ DRIVER = "gentl-simulated"
 
 
 class GentlArms:
-    """Openers of the arms whose driver is "gentl-simulated"; touches nothing until one is asked for."""
+    """Openers of the arms whose driver is "gentl-simulated"; starts nothing before the first is requested."""
 
     def __init__(self, config: RigConfig) -> None:
         self._config = config
         self._bench: GentlBench | None = None
 
     def opener(self, arm: str, sensor: Callable[[str], CameraOpener]) -> CameraOpener:
-        """What opens the arm's camera through harvesters; ``sensor`` gives the model that feeds it.
+        """Return the opener of the arm's camera through harvesters; ``sensor`` supplies the model behind it.
 
         Raises DeviceError without a C compiler.
         """
@@ -38,14 +38,14 @@ class GentlArms:
         return HarvestersOpener(spec_of(self._config, arm, str(self._bench.cti)))
 
     def close(self) -> None:
-        """Take the cameras away. Idempotent."""
+        """Remove the cameras. Idempotent."""
         if self._bench is not None:
             self._bench.close()
             self._bench = None
 
 
 def model_of(config: RigConfig, arm: str) -> CameraModel:
-    """The camera that the rig's file describes for an arm."""
+    """Return the camera that the rig file describes for an arm."""
     camera = config.cameras.arm(arm)
     return CameraModel(
         camera.serial,
@@ -57,5 +57,5 @@ def model_of(config: RigConfig, arm: str) -> CameraModel:
 
 
 def sensor_width(config: RigConfig) -> int:
-    """Pixels of the camera's lines: an arm's, or as many as both arms take."""
+    """Return the pixels of the camera's lines: one arm's, or enough for both arms on one sensor."""
     return max((end for _, end in config.columns.values()), default=config.pixels)

@@ -1,7 +1,7 @@
-"""A directory that any GenICam program can load: the producer, and beside it its cameras.
+"""A directory that any GenICam program can load: the producer, and next to it its cameras.
 
-Closing it ends the feeding processes and takes the cameras away. Should the owner be killed, the cameras'
-memory goes with it; what stays is a directory of dead links.
+Closing it ends the feeding processes and removes the cameras. If the owner is killed, the cameras' memory is
+freed with it, and only a directory of dead links remains.
 """
 
 from __future__ import annotations
@@ -36,10 +36,10 @@ class GentlBench:
 
     Parameters
     ----------
-    cameras : model of each camera → what opens its sensor, in a process of its own
-    life : what such a process does; `acquire.sim.gentl.feeder.feed` unless a test has a better idea
+    cameras : model of each camera → opener of its sensor, which is called in a separate process
+    life : main function of such a process, `acquire.sim.gentl.feeder.feed` except in tests
 
-    Raises DeviceError without a C compiler (nothing is left behind then), UsageError for equal serials.
+    Raises DeviceError without a C compiler, and leaves nothing behind; UsageError for equal serials.
     """
 
     def __init__(self, cameras: Mapping[CameraModel, Any], life: Callable[..., None] = feed) -> None:
@@ -48,7 +48,7 @@ class GentlBench:
         if len(set(serials)) < len(serials):
             raise UsageError(
                 f"simulated cameras cannot have the serials {', '.join(serials)}",
-                possible="one of its own for each",
+                possible="a different serial for each",
             )
         self._directory = Path(tempfile.mkdtemp(prefix="acquire-gentl-"))
         self.cameras: dict[str, CameraMemory] = {}
@@ -61,11 +61,11 @@ class GentlBench:
 
     @property
     def cti(self) -> Path:
-        """The producer's file."""
+        """Path of the producer."""
         return self._directory / CTI
 
     def _fill(self, producer: Path, cameras: Mapping[CameraModel, Any], life: Callable[..., None]) -> None:
-        # A copy, not a link: the producer looks for its cameras beside itself.
+        # A copy, not a link: the producer looks for its cameras in its own directory.
         shutil.copy(producer, self.cti)
         (self._directory / layout.HOST_FILE).write_bytes(host_ports())
         for model, opener in cameras.items():
@@ -77,7 +77,7 @@ class GentlBench:
             feeder.expect(Ready, deadline)
 
     def close(self) -> None:
-        """End the feeders, take cameras and directory away. Idempotent."""
+        """End the feeders, and remove the cameras and the directory. Idempotent."""
         deadline = time.monotonic() + _END_S
         for feeder in self._feeders:
             feeder.end(deadline)

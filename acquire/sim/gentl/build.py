@@ -1,6 +1,6 @@
-"""``python -m acquire.sim.gentl.build``: compile the producer, once per content, where a C compiler is.
+"""``python -m acquire.sim.gentl.build``: compile the producer once per content, with any C compiler.
 
-The result lies in the user's cache, named after a hash of the sources and of the compiler's name.
+The result is kept in the user's cache and named after a hash of the sources and of the compiler's name.
 """
 
 from __future__ import annotations
@@ -31,28 +31,28 @@ COMPILE_S = 120.0
 
 
 def compiler() -> str | None:
-    """The C compiler that would be used: $CC, else cc, gcc or clang; None where there is none."""
+    """Return the C compiler that would be used: $CC, else cc, gcc or clang; None if there is none."""
     names = [os.environ["CC"]] if os.environ.get("CC") else ["cc", "gcc", "clang"]
     return next((found for name in names if (found := shutil.which(name))), None)
 
 
 def build() -> Path:
-    """The producer's .cti, compiled if it is not there. Raises DeviceError without a compiler."""
+    """Return the producer's .cti, which is compiled if necessary. Raises DeviceError without a compiler."""
     found = compiler()
     if found is None:
         raise DeviceError(
             "the simulated GenTL producer has to be compiled, and there is no C compiler",
             possible="cc, gcc or clang on PATH, or CC in the environment",
-            hint="the system's compiler package, or the simulated cameras without GenTL",
+            hint="install the system's compiler package, or use the simulated cameras without GenTL",
         )
-    # All that the result depends on is in its name, so that another version's is left alone.
+    # The name covers everything that the result depends on, so that versions do not overwrite each other.
     digest = hashlib.sha256("\0".join((SOURCE.read_text(), header(), found, *OPTIONS)).encode()).hexdigest()
     base = os.environ.get("XDG_CACHE_HOME")
     cache = (Path(base) if base else Path.home() / ".cache") / "tdi-acquire"
     target = cache / f"acquire-simulated-{digest[:16]}.cti"
     if not target.is_file():
         target.parent.mkdir(parents=True, exist_ok=True)
-        # Into a directory beside the target, then moved: two builds at once both end well.
+        # Compiled into a directory next to the target, then moved: concurrent builds both succeed.
         with tempfile.TemporaryDirectory(dir=target.parent) as name:
             directory = Path(name)
             (directory / "layout.h").write_text(header())
@@ -62,7 +62,7 @@ def build() -> Path:
                 command, capture_output=True, text=True, timeout=COMPILE_S, check=False
             )
             if done.returncode:
-                raise DeviceError(f"{found} refused the producer: {done.stderr.strip()[-2000:]}")
+                raise DeviceError(f"{found} failed to compile the producer: {done.stderr.strip()[-2000:]}")
             made.replace(target)
     return target
 

@@ -1,7 +1,7 @@
-"""Features of simulated modules as a table, and what follows from it: GenICam XML and register contents.
+"""Features of simulated modules as a table, from which GenICam XML and register contents are generated.
 
-A feature is one register of 8 bytes (64 for texts), little-endian. A selected feature has one register per
-entry of its selector, one after the other.
+A feature is one register of 8 bytes (64 for texts), little-endian. A selected feature has consecutive
+registers, one per entry of its selector.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ class Feature:
     """One SFNC or vendor feature.
 
     ``entries`` are an enumeration's names and numbers; ``maximum`` may be a formula whose variables ``of``
-    maps to features; ``at`` is the register's address, given to the producer's own ones only.
+    maps to features; ``at`` is the register's address, given only for registers that the producer uses.
     """
 
     name: str
@@ -50,16 +50,16 @@ class Feature:
 
 
 def enum(name: str, names: Sequence[str], category: str, tip: str = "", **more: object) -> Feature:
-    """An enumeration whose entries count from 0; the first is its value unless said."""
+    """Return an enumeration whose entries count from 0; its value is the first unless given."""
     entries = {entry: number for number, entry in enumerate(names)}
-    made = Feature(name, "enum", names[0], entries=entries, category=category, tip=tip)
-    return replace(made, **more)  # type: ignore[arg-type]
+    feature = Feature(name, "enum", names[0], entries=entries, category=category, tip=tip)
+    return replace(feature, **more)  # type: ignore[arg-type]
 
 
 class Module:
     """The features of one GenTL module at their addresses.
 
-    Raises ValueError for a table that does not fit its space.
+    Raises ValueError if the table does not fit into the module's register space.
     """
 
     def __init__(self, name: str, features: Iterable[Feature], port: str = "") -> None:
@@ -74,10 +74,10 @@ class Module:
                 free += feature.size * self._copies(feature)
             self.features[feature.name] = placed
         if free > URL_AT:
-            raise ValueError(f"module {name} has registers up to {free:#x}, and room until {URL_AT:#x}")
+            raise ValueError(f"module {name} has registers up to {free:#x}, and room only up to {URL_AT:#x}")
 
     def space(self, base: int = 0) -> bytes:
-        """The module's whole register space, at address ``base``: values, URL and XML."""
+        """Return the module's whole register space, at address ``base``: values, URL and XML."""
         text = self.xml(base).encode()
         url = f"local:{self.name}.xml;{XML_AT:X};{len(text):X}".encode()
         if XML_AT + len(text) > PORT_BYTES:
@@ -98,7 +98,7 @@ class Module:
         return len(self.features[feature.selector].entries) if feature.selector else 1
 
     def xml(self, base: int = 0) -> str:
-        """The GenICam description (schema 1.1); node order inside an element is the schema's."""
+        """Return the GenICam description (schema 1.1); the node order within an element is the schema's."""
         self._base = base
         categories: dict[str, list[str]] = {}
         for feature in self.features.values():
@@ -106,17 +106,15 @@ class Module:
         parts = [_HEAD.format(name=self.name, port=self.port)]
         parts.append(_category("Root", list(categories)))
         parts += [_category(name, members) for name, members in categories.items()]
-        parts += [self._node(feature) for feature in self.features.values()]
+        for feature in self.features.values():
+            selected = "".join(
+                f"<pSelected>{other.name}</pSelected>"
+                for other in self.features.values()
+                if other.selector == feature.name
+            )
+            parts.append(_NODES[feature.kind](self, feature, selected))
         parts.append(f'<Port Name="{self.port}"/>\n</RegisterDescription>\n')
         return "".join(parts)
-
-    def _node(self, feature: Feature) -> str:
-        selected = "".join(
-            f"<pSelected>{other.name}</pSelected>"
-            for other in self.features.values()
-            if other.selector == feature.name
-        )
-        return _NODES[feature.kind](self, feature, selected)
 
     def _register(self, feature: Feature, kind: str, tail: str) -> str:
         index = f'<pIndex Offset="{feature.size}">{feature.selector}Reg</pIndex>' if feature.selector else ""
@@ -128,25 +126,26 @@ class Module:
         )
 
     def _integer(self, feature: Feature, selected: str) -> str:
-        most, knife = self._maximum(feature)
+        maximum, swiss_knife = self._maximum(feature)
         unit = f"<Unit>{feature.unit}</Unit>" if feature.unit else ""
         return (
             f'<Integer Name="{feature.name}">{_common(feature)}<pValue>{feature.name}Reg</pValue>'
-            f"<Min>{int(feature.minimum)}</Min>{most}<Inc>{feature.increment}</Inc>{unit}{selected}</Integer>\n"
-            f"{knife}{self._register(feature, 'IntReg', _INT)}"
+            f"<Min>{int(feature.minimum)}</Min>{maximum}<Inc>{feature.increment}</Inc>{unit}{selected}"
+            f"</Integer>\n{swiss_knife}{self._register(feature, 'IntReg', _INT)}"
         )
 
     def _maximum(self, feature: Feature) -> tuple[str, str]:
+        """Return the element for an integer's maximum, and the IntSwissKnife node of its formula, if any."""
         if not isinstance(feature.maximum, str):
             return f"<Max>{int(feature.maximum)}</Max>", ""
-        knife = f"{feature.name}Max"
+        name = f"{feature.name}Max"
         variables = "".join(
-            f'<pVariable Name="{name}">{of}Reg</pVariable>' for name, of in feature.of.items()
+            f'<pVariable Name="{variable}">{of}Reg</pVariable>' for variable, of in feature.of.items()
         )
         formula = f"<Formula>{escape(feature.maximum)}</Formula>"
         return (
-            f"<pMax>{knife}</pMax>",
-            f'<IntSwissKnife Name="{knife}">{variables}{formula}</IntSwissKnife>\n',
+            f"<pMax>{name}</pMax>",
+            f'<IntSwissKnife Name="{name}">{variables}{formula}</IntSwissKnife>\n',
         )
 
     def _real(self, feature: Feature, selected: str) -> str:
@@ -226,6 +225,7 @@ def _common(feature: Feature) -> str:
 
 
 def _encode(feature: Feature) -> bytes:
+    """Return the bytes of a feature's register."""
     value = feature.value
     if feature.kind == "text":
         return str(value).encode()[: TEXT_BYTES - 1]

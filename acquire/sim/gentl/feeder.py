@@ -1,4 +1,4 @@
-"""The process behind one simulated GenTL camera: it reads out the sensor while the host acquires.
+"""The process behind one simulated GenTL camera: it reads out the sensor while the host is acquiring.
 
 ::
 
@@ -27,7 +27,7 @@ _BLOCK_WAIT_S = 0.01
 
 
 class Sensor(Protocol):
-    """What feeds a camera: `acquire.sim.devices.SimulatedCamera`, or a test's."""
+    """The source of a camera's lines: `acquire.sim.devices.SimulatedCamera`, or a test's own."""
 
     def arm(self) -> None: ...
 
@@ -39,20 +39,20 @@ class Sensor(Protocol):
 
 
 def feed(mailbox: Mailbox, memory: CameraMemory, opener: Callable[[], Any]) -> None:
-    """Life of a feeder: obey the host's word to acquire or not, hand on lines, until told to end."""
+    """Main function of a feeder: follow the host's start and stop requests and pass on lines."""
     sensor: Sensor = opener()
     mailbox.post(Ready())
-    wanted = False
+    acquiring = False
     while True:
-        mailbox.take()
-        if memory.asked:
+        mailbox.take()  # raises when the owner ends the process
+        if memory.request_pending:
             session = memory["SESSION"]
             if session & 1:
                 sensor.arm()
             else:
                 sensor.disarm()
-            wanted = memory.obey(session)
-        elif not wanted:
+            acquiring = memory.acknowledge(session)
+        elif not acquiring:
             time.sleep(_IDLE_S)
         elif (block := sensor.next_block(_BLOCK_WAIT_S)) is not None:
             memory.write(block.first_line, block.pixels, sensor.times_ns(block.first_line, len(block.pixels)))

@@ -1,15 +1,15 @@
-"""Where everything lies in the file through which a simulated camera and its GenTL producer speak.
+"""Layout of the file through which a simulated camera and its GenTL producer communicate.
 
 ::
 
-    words      who the camera is, how lines lie, head and tail of the line ring, faults   (64-bit words)
+    words      the camera, the format of lines, head and tail of the line ring, faults    (64-bit words)
     ports      register space of the modules: remote device, device, stream               (64 KiB each)
     headers    (line id, t_ns) per line                                                   (16 bytes each)
     lines      sensor-wide samples, uint8 or uint16                                       (a ring)
 
-One file per camera, and one with the ports of system and interface. Python writes all of it and every
-line; the producer (C) reads lines and serves the ports. Numbers are defined here alone: `header` gives them
-to the compiler.
+There is one file per camera, and one with the ports of system and interface. Python writes all of it and
+every line; the producer (in C) reads lines and serves the ports. The numbers are defined only here: `header`
+passes them to the compiler.
 """
 
 from __future__ import annotations
@@ -20,9 +20,9 @@ VERSION = 1
 WORD_BYTES = 8
 PORT_BYTES = 1 << 16
 XML_AT = 0x2000
-"""Within a port's space: registers below, the XML from here."""
+"""Start of the XML within a port's space; registers are below it."""
 URL_AT = 0x1F00
-"""Within a port's space: the URL of the XML, as text ended by 0."""
+"""Start of the XML's URL within a port's space, as zero-terminated text."""
 TEXT_BYTES = 64
 PORTS_AT = 0x4000
 
@@ -36,17 +36,17 @@ WORDS = (
     "ROW_PADDING", "ID_BITS", "ID_FIRST",
     "FRAMES", "DELIVERED", "UNDERRUNS", "FAULTS_FIRED",
 )  # fmt: skip
-"""Words from the beginning of the file.
+"""Words at the beginning of the file.
 
-PRESENT      1 while the camera is plugged in; PLUGGED counts how often it was
-SESSION, ACK odd while the host acquires; the feeding side repeats it in ACK once it obeys
-HEAD, TAIL   lines written by the feeding side, lines taken by the producer, since ever
+PRESENT      1 while the camera is plugged in; PLUGGED counts how often it was plugged in
+SESSION, ACK odd while the host acquires; the feeder copies it to ACK once it has carried out the request
+HEAD, TAIL   total lines written by the feeder, and total lines taken by the producer
 """
 
 FAULTS_AT = 64
 FAULTS = 64
 FAULT_WORDS = 4
-"""Words of a fault: kind (0: free), frame or line at which it happens, how many, whether it has happened."""
+"""Words of a fault: kind (0: free), frame or line at which it happens, count, whether it has happened."""
 
 FAULT_KINDS = ("", "BAD", "SHORT", "DROP", "OVERRUN", "GONE", "MISSED")
 
@@ -69,7 +69,7 @@ PIXEL_FORMATS = {
     "Mono12Packed": (0x010C0006, 12, 12),
     "Mono16": (0x01100007, 16, 16),
 }
-"""SFNC name → PFNC code, bits that count, bits that a pixel takes."""
+"""SFNC name → PFNC code, significant bits, stored bits per pixel."""
 
 REGISTERS = {
     "Width": 0x00, "OffsetX": 0x08, "Height": 0x10, "PixelFormat": 0x18, "PayloadSize": 0x20,
@@ -81,7 +81,7 @@ FREE_REGISTERS_AT = 0x100
 
 
 def header() -> str:
-    """The same numbers for the compiler."""
+    """Return the same numbers as a C header."""
     numbers: dict[str, int] = {
         "MAGIC": MAGIC,
         "VERSION": VERSION,

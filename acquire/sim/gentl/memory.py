@@ -1,7 +1,8 @@
-"""One simulated camera as a file: what Python writes and the producer reads (`layout`).
+"""One simulated camera as a file, which Python writes and the producer reads (`layout`).
 
-The file is anonymous memory: whoever is given the object by being spawned shares it, and the producer finds
-it through a link into the owner's ``/proc/PID/fd``. When the owner dies, however it dies, it is gone.
+The file is anonymous memory: a process that receives the object when it is spawned shares it, and the
+producer finds it through a link into the owner's ``/proc/PID/fd``. It disappears with the owner, however that
+ends.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ if TYPE_CHECKING:
     from acquire.sim.gentl.models import CameraModel
 
 RING_BYTES = 64 << 20
-"""Lines that wait for the producer: it takes them all the time, so this bridges its scheduling only."""
+"""Size of the ring of lines. The producer takes them continuously, so it only bridges scheduling delays."""
 _AT = {name: at for at, name in enumerate(layout.WORDS)}
 _POLL_S = 0.0005
 
@@ -31,8 +32,8 @@ class CameraMemory:
 
     Attributes
     ----------
-    model : who the camera is
-    headers : (line, 2) uint64: line id and t_ns; row ``k mod capacity`` is line k's
+    model : the camera
+    headers : (line, 2) uint64: line id and t_ns; row ``k mod capacity`` belongs to line k
     lines : (line, pixel) uint8 or uint16
     """
 
@@ -55,6 +56,7 @@ class CameraMemory:
             self._write_model(headers_at, lines_at)
 
     def _write_model(self, headers_at: int, lines_at: int) -> None:
+        """Write everything except lines; MAGIC comes last, since it marks the memory as complete."""
         model, shared = self.model, self._memory.map
         texts = (model.serial, model.model, models.VENDOR, model.firmware)
         for position, text in enumerate(texts):
@@ -91,27 +93,27 @@ class CameraMemory:
 
     @property
     def path(self) -> str:
-        """Where other processes find the memory while this one lives."""
+        """Path at which other processes find the memory while this process lives."""
         return self._memory.path
 
-    # ---- the camera's own hand: what happens on a bench
+    # ---- events on the bench
 
     def unplug(self) -> None:
-        """The device is gone: every access to it fails until it is opened again after `plug`."""
+        """Unplug the device: every access to it fails until it is opened again after `plug`."""
         self["PRESENT"] = 0
 
     def plug(self) -> None:
-        """The device is there again, as after a loose connector: settings and clock go on."""
+        """Plug the device in again, as after a loose connector: its settings and its clock are kept."""
         if not self["PRESENT"]:
             self["PLUGGED"] += 1
             self["PRESENT"] = 1
 
     def inject(self, kind: str, at: int, count: int = 1) -> None:
-        """Let a fault happen at frame ``at`` since acquisition start, once.
+        """Inject a fault at frame ``at`` since acquisition start, once.
 
-        ``BAD`` marks the frame incomplete · ``SHORT`` delivers its first ``count`` lines only; both leave id
+        ``BAD`` marks the frame incomplete · ``SHORT`` delivers only its first ``count`` lines; both leave id
         and time as they were in the buffer · ``DROP`` loses ``count`` frames on the link · ``OVERRUN`` finds
-        no buffer for ``count`` frames · ``GONE`` unplugs the device · ``MISSED`` blinds the camera for
+        no buffer for ``count`` frames · ``GONE`` unplugs the device · ``MISSED`` makes the camera miss
         ``count`` trigger pulses from line ``at`` on.
         """
         if kind not in layout.FAULT_KINDS[1:]:
@@ -119,34 +121,37 @@ class CameraMemory:
         for slot in range(layout.FAULTS):
             first = layout.FAULTS_AT + slot * layout.FAULT_WORDS
             if not self._words[first] or self._words[first + 3]:
+                # The kind comes last: the producer must not see it before the fault's other words.
                 self._words[first] = 0
                 self._words[first + 1], self._words[first + 2], self._words[first + 3] = at, count, 0
                 self._words[first] = layout.FAULT_KINDS.index(kind)
                 return
-        raise UsageError(f"more than {layout.FAULTS} faults wait to happen")
+        raise UsageError(f"no more than {layout.FAULTS} faults can be pending")
 
-    # ---- the feeding side
+    # ---- the feeder
 
     @property
-    def asked(self) -> bool:
-        """The host began or ended acquiring, and waits for `obey`."""
+    def request_pending(self) -> bool:
+        """True if the host started or stopped acquisition, and waits for `acknowledge`."""
         return self["SESSION"] != self["ACK"]
 
-    def obey(self, session: int) -> bool:
-        """Tell the host that its word is done; True when lines are wanted from now on."""
+    def acknowledge(self, session: int) -> bool:
+        """Report to the host that its request is done; return True if lines are wanted from now on."""
         self["ACK"] = session
         return bool(session & 1)
 
     def write(self, first_line: int, lines: NDArray[Any], times_ns: NDArray[np.int64]) -> bool:
-        """Put lines (line, pixel) into the ring; False when the host went away while it was full.
+        """Put lines (line, pixel) into the ring; return False if the host left while the ring was full.
 
-        Waits for room: the producer never leaves the ring full while it acquires.
+        Waits for room, since the producer empties the ring as long as it acquires.
         """
         done = 0
         while done < len(lines):
-            room = self._room(min(len(lines) - done, self._capacity // 2))
-            if not room:
-                return False
+            needed = min(len(lines) - done, self._capacity // 2)
+            while (room := self._capacity - (self["HEAD"] - self["TAIL"])) < needed:
+                if self.request_pending or not self["PRESENT"]:
+                    return False
+                time.sleep(_POLL_S)
             slot = self["HEAD"] % self._capacity
             count = min(room, len(lines) - done, self._capacity - slot)
             self.lines[slot : slot + count] = lines[done : done + count]
@@ -157,15 +162,8 @@ class CameraMemory:
             done += count
         return True
 
-    def _room(self, least: int) -> int:
-        while (room := self._capacity - (self["HEAD"] - self["TAIL"])) < least:
-            if self.asked or not self["PRESENT"]:
-                return 0
-            time.sleep(_POLL_S)
-        return room
-
     def close(self) -> None:
-        """Release the memory; other holders keep theirs. Idempotent."""
+        """Release this process's mapping of the memory. Idempotent."""
         self._words.release()
         self.lines = self.headers = np.empty((0, 0), np.uint8)
         self._memory.close()
@@ -175,5 +173,5 @@ class CameraMemory:
 
 
 def host_ports() -> bytes:
-    """The register spaces of system and interface, one after the other."""
+    """Return the register spaces of system and interface, one after the other."""
     return models.system().space() + models.interface().space()

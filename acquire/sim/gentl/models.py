@@ -1,7 +1,7 @@
-"""The modules of the simulated cameras: names as TDI CoaXPress cameras and their grabbers have them.
+"""The modules of the simulated cameras, with the feature names of TDI CoaXPress cameras and their grabbers.
 
-Public SFNC names wherever there is one; SFNC has none for time delay and integration, so those follow
-what cameras on the market call them.
+Features have their public SFNC names where these exist. SFNC has none for time delay and integration, so
+those features are named as in cameras on the market.
 """
 
 from __future__ import annotations
@@ -17,10 +17,10 @@ MODEL = "simulated TDI line-scan camera"
 
 @dataclass(frozen=True, slots=True)
 class CameraModel:
-    """What distinguishes one simulated camera from another.
+    """The properties of one simulated camera.
 
-    ``row_padding`` bytes follow every line in a buffer; frame ids have ``id_bits`` bits and begin, and
-    begin again after a wrap, at ``id_first``.
+    ``row_padding`` bytes follow every line in a buffer. Frame ids have ``id_bits`` bits, and start at
+    ``id_first``, also after they wrap around.
     """
 
     serial: str
@@ -84,7 +84,7 @@ def _image(model: CameraModel) -> tuple[Feature, ...]:
         ),
         Feature(
             "Height", value=1, minimum=1, maximum=1, category=category, at=REGISTERS["Height"],
-            tip="a line-scan camera sends lines; how many make a buffer is the stream's BufferHeight",
+            tip="a line-scan camera sends lines; the stream's BufferHeight sets the lines per buffer",
         ),
         Feature(
             "PixelFormat", "enum", model.pixel_format, entries=formats, locked=True, category=category,
@@ -102,7 +102,7 @@ def _acquisition(model: CameraModel) -> tuple[Feature, ...]:
         Feature("AcquisitionStop", "command", category=category, at=REGISTERS["AcquisitionStop"]),
         Feature(
             "AcquisitionLineRate", "float", model.line_rate_hz, 1.0, 2e6, category=category, unit="Hz",
-            tip="what the camera is prepared for; with a line trigger the trigger alone decides",
+            tip="line rate that the camera is prepared for; a line trigger alone sets the actual rate",
         ),
         enum("OperationMode", ["TDI", "Area"], category, locked=True),
         enum("TDIStages", [f"TDI{n}" for n in (64, 128, 192, 256)], category, locked=True),
@@ -136,24 +136,18 @@ def _counters() -> tuple[Feature, ...]:
 
 
 def gige(model: CameraModel) -> Module:
-    """The camera with a GigE Vision port: its frames have a height, and pixels are not packed."""
-    kept = [feature for feature in remote(model).features.values() if feature.name != "PixelFormat"]
+    """The camera with a GigE Vision port: its frames have a height, and its pixels are not packed."""
+    features = dict(remote(model).features)
+    features["Height"] = replace(features["Height"], value=256, maximum=4096, tip="lines per frame")
+    payload = 256 * model.sensor_width * model.sample_bytes
+    features["PayloadSize"] = replace(features["PayloadSize"], value=payload)
     formats = {name: PIXEL_FORMATS[name][0] for name in ("Mono8", "Mono10", "Mono12", "Mono16")}
-    format_of = Feature(
+    del features["PixelFormat"]  # which is appended instead
+    features["PixelFormat"] = Feature(
         "PixelFormat", "enum", model.pixel_format, entries=formats, locked=True,
         category="ImageFormatControl", at=REGISTERS["PixelFormat"],
     )  # fmt: skip
-    features = [*(_gige_feature(feature, model) for feature in kept), format_of]
-    return Module("Remote", features, port="Device")  # the name that GigE Vision gives it
-
-
-def _gige_feature(feature: Feature, model: CameraModel) -> Feature:
-    match feature.name:
-        case "Height":
-            return replace(feature, value=256, maximum=4096, tip="lines per frame")
-        case "PayloadSize":
-            return replace(feature, value=256 * model.sensor_width * model.sample_bytes)
-    return feature
+    return Module("Remote", features.values(), port="Device")  # the port's name in GigE Vision
 
 
 def device(model: CameraModel) -> Module:
@@ -173,7 +167,7 @@ def device(model: CameraModel) -> Module:
 
 
 def stream() -> Module:
-    """The way from the grabber to memory; how many lines make a buffer is said here."""
+    """The link from the grabber to memory, which sets the number of lines per buffer."""
     category = "StreamControl"
     return Module(
         "Stream",

@@ -1,1 +1,1 @@
-"""A simulated GigE Vision camera: real packets over the loopback interface, lines from the forward model."""
+"""A simulated GigE Vision camera: real packets on the loopback interface, lines from the forward model."""

@@ -1,4 +1,4 @@
-"""The simulated cameras of a rig behind GigE Vision: a process and a loopback address for each."""
+"""The simulated cameras of a rig behind GigE Vision, each with its own process and loopback address."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _END_S = 5.0
 
 
 class GigeArms:
-    """Openers of the arms whose driver is "gige-simulated"; touches nothing until one is asked for."""
+    """Openers of the arms whose driver is "gige-simulated"; starts nothing before the first is requested."""
 
     def __init__(self, config: RigConfig) -> None:
         self.transmission = Transmission()
@@ -33,26 +33,26 @@ class GigeArms:
         self._servers: dict[str, Worker] = {}
 
     def opener(self, arm: str, sensor: Callable[[str], CameraOpener]) -> CameraOpener:
-        """What opens the arm's camera through Aravis; ``sensor`` gives the model that feeds it.
+        """Return the opener of the arm's camera through Aravis; ``sensor`` supplies the model behind it.
 
-        Raises CameraError without Aravis, DeviceError where another camera has the address.
+        Raises CameraError without Aravis, DeviceError if another camera has the address.
         """
         load()
         if arm not in self._servers:
-            how = (model_of(self._config, arm), sensor(arm), address_of(arm), self.transmission)
-            server = Worker(f"camera {arm}", serve, *how)
+            arguments = (model_of(self._config, arm), sensor(arm), address_of(arm), self.transmission)
+            server = Worker(f"camera {arm}", serve, *arguments)
             self._servers[arm] = server
             server.expect(Ready, time.monotonic() + _START_S)
         return AravisOpener(spec_of(self._config, arm, address_of(arm)))
 
     def close(self) -> None:
-        """Take the cameras away. Idempotent."""
+        """Remove the cameras. Idempotent."""
         while self._servers:
             _, server = self._servers.popitem()
             server.end(time.monotonic() + _END_S)
 
 
 def address_of(arm: str) -> str:
-    """A loopback address that no other process of this host has for its cameras."""
+    """Return a loopback address that no other process of this host uses for its cameras."""
     pid = os.getpid() % (1 << 16)
     return f"127.{1 + pid // 256 % 254}.{pid % 256}.{1 + ARMS.index(arm)}"

@@ -1,7 +1,7 @@
-"""The process of a simulated GigE Vision camera: it answers control packets, and sends what its sensor reads
-out, ``Height`` lines at a time. One per loopback address.
+"""The process of a simulated GigE Vision camera, of which there is one per loopback address.
 
-Packets that the host misses are sent again while the camera still has their frame.
+It answers control packets and sends the lines that its sensor reads out, ``Height`` lines at a time. Packets
+that the host misses are sent again as long as the camera keeps their frame.
 """
 
 from __future__ import annotations
@@ -34,17 +34,17 @@ _BASE = protocol.BOOTSTRAP_BYTES
 
 
 _KEPT_FRAMES = 16
-"""Of which packets can be sent again."""
+"""Number of recent frames whose packets can be sent again."""
 Link = Callable[[int, list[bytes]], Iterable[bytes]]
-"""Which of a frame's packets reach the host, and in what order; frames count from 0."""
+"""Selects the packets of a frame that reach the host, and their order; frames count from 0."""
 
 
 @dataclass(frozen=True, slots=True)
 class Transmission:
-    """How frames are numbered, and what becomes of them on their way. Picklable if ``link`` is.
+    """Numbering of frames, and losses on the link. Picklable if ``link`` is.
 
-    ``first_id`` : of every acquisition; ids skip 0. ``extended`` : ids of 64 bits instead of 16.
-    ``resends`` : packets are sent again when the host asks. ``link`` : None loses nothing.
+    ``first_id`` : first id of every acquisition; ids skip 0. ``extended`` : ids of 64 bits instead of 16.
+    ``resends`` : packets are sent again when the host asks for them. ``link`` : None loses nothing.
     """
 
     first_id: int = 1
@@ -53,7 +53,7 @@ class Transmission:
     link: Link | None = None
 
     def frame_id(self, frame: int) -> int:
-        """The id of a frame; frames count from 0."""
+        """Return the id of a frame; frames count from 0."""
         return 1 + (self.first_id - 1 + frame) % (2**64 - 1 if self.extended else 0xFFFF)
 
 
@@ -64,16 +64,16 @@ def serve(
     address: str = "127.0.0.1",
     transmission: Transmission = Transmission(),
 ) -> None:
-    """Life of the camera: control and lines in turn, until told to end."""
+    """Main function of the camera's process: serve control packets and lines in turn."""
     with GigeCamera(model, opener(), address, transmission) as camera:
         mailbox.post(Ready())
         while True:
-            mailbox.take()
+            mailbox.take()  # raises when the owner ends the process
             camera.turn()
 
 
 class GigeCamera:
-    """See the module. Raises DeviceError when the address is taken."""
+    """See the module. Raises DeviceError if the address is taken."""
 
     def __init__(self, model: CameraModel, sensor: Sensor, address: str, transmission: Transmission) -> None:
         space = gige(model).space(_BASE)
@@ -100,7 +100,7 @@ class GigeCamera:
         self._waiting: list[tuple[int, NDArray[Any]]] = []
 
     def turn(self) -> None:
-        """What can be done now; waits a moment when there is nothing."""
+        """Serve what is due now; wait a moment if there is nothing."""
         ready, _, _ = select.select(self._control, [], [], 0 if self._acquiring else _IDLE_S)
         for control in ready:
             self._answer(control)
@@ -120,21 +120,23 @@ class GigeCamera:
         if request is None:
             return
         if request.command == protocol.Command.RESEND:
-            # Of a frame that is not kept any more nothing is answered: the host gives it up.
+            # A request for a frame that is no longer kept gets no answer: the host gives the frame up.
             number, first, last = protocol.parse_resend(request)
             for kept, packets in self._sent if self.transmission.resends else ():
                 if kept == number:
                     self._put(packets[first : last + 1])
             return
-        if (sender, request) != self._answered[:2]:  # else the host has not seen the answer in time
+        # The same request again means that its answer did not arrive in time: only the answer is repeated.
+        if (sender, request) != self._answered[:2]:
             self._answered = (sender, request, self._registers.handle(request))
-            self._obey()  # the host may start the trigger once it has the answer
+            # Before the answer is sent: the host may start the trigger as soon as it has the answer.
+            self._apply_registers()
         reply = self._answered[2]
         if reply is not None:
             self._control[0].sendto(reply, sender)
 
-    def _obey(self) -> None:
-        """Commands are registers that the host sets; reading them back as 0 says that they are done."""
+    def _apply_registers(self) -> None:
+        """Carry out the commands that the host has set in registers; they read back as 0 once done."""
         stored = next(
             stored for at, _, stored in PIXEL_FORMATS.values() if at == self._register("PixelFormat")
         )
@@ -155,9 +157,14 @@ class GigeCamera:
     def _send(self, time_ns: int, lines: NDArray[Any]) -> None:
         code = self._register("PixelFormat")
         offset, width = self._register("OffsetX"), self._register("Width")
-        data = _pack(lines[:, offset : offset + width], self._bits, code)
-        sent = self.transmission
-        number = sent.frame_id(self._frames)
+        # Samples as the pixel format stores them; `gige` offers only formats that are not packed.
+        significant, stored = next((used, bits) for at, used, bits in PIXEL_FORMATS.values() if at == code)
+        samples = lines[:, offset : offset + width]
+        excess = self._bits - significant
+        samples = samples >> excess if excess > 0 else samples << -excess
+        data = samples.astype("<u2" if stored == 16 else "u1").tobytes()
+        transmission = self.transmission
+        number = transmission.frame_id(self._frames)
         frame = protocol.Frame(
             number=number,
             time_ns=time_ns,
@@ -165,11 +172,11 @@ class GigeCamera:
             width=width,
             height=len(lines),
             data=data,
-            extended=sent.extended,
+            extended=transmission.extended,
         )
         packets = list(protocol.packets(frame, self._registers.get(protocol.PACKET_SIZE) & 0xFFFF))
         self._sent.append((number, packets))
-        self._put(packets if sent.link is None else sent.link(self._frames, packets))
+        self._put(packets if transmission.link is None else transmission.link(self._frames, packets))
         self._frames += 1
 
     def _put(self, packets: Iterable[bytes]) -> None:
@@ -189,25 +196,18 @@ class GigeCamera:
         return self
 
     def __exit__(self, *_: object) -> None:
-        for used in (*self._control, self._lines):
-            used.close()
+        for each in (*self._control, self._lines):
+            each.close()
 
 
 def _bound(host: str, *, shared: bool) -> socket.socket:
-    """Broadcasts look for every camera: all of them listen to the one address."""
-    made = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-    made.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, shared)
-    made.setsockopt(socket.SOL_SOCKET, socket.SO_BROADCAST, 1)
+    """Return a control socket; ``shared`` for the broadcast address, on which every camera listens."""
+    control = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    control.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, shared)
+    control.setsockopt(socket.SOL_SOCKET, socket.SO_BROADCAST, 1)
     try:
-        made.bind((host, protocol.PORT))
+        control.bind((host, protocol.PORT))
     except OSError as error:
-        made.close()
+        control.close()
         raise DeviceError(f"the GigE Vision camera cannot be opened on {host}: {error.strerror}") from error
-    return made
-
-
-def _pack(lines: NDArray[Any], bits: int, code: int) -> bytes:
-    """Lines as the pixel format has them (unpacked ones only)."""
-    want, stored = next((want, stored) for at, want, stored in PIXEL_FORMATS.values() if at == code)
-    values = lines >> (bits - want) if bits > want else lines << (want - bits)
-    return values.astype("<u2" if stored == 16 else "u1").tobytes()
+    return control

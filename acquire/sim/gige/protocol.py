@@ -1,4 +1,4 @@
-"""The packets of GigE Vision that a camera needs: bytes in, bytes out, no socket.
+"""The GigE Vision packets that a camera needs: bytes in and bytes out, without sockets.
 
 ::
 
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 PORT = 3956
 KEY = 0x42
 IP_AND_UDP_BYTES = 20 + 8
-"""Of headers within the packet size that the host sets; GVSP's own come on top."""
+"""Bytes of IP and UDP headers, which count towards the packet size that the host sets, as GVSP's own do."""
 
 DEVICE_MODE, MAC, ADDRESS = 0x0004, 0x0008, 0x0024
 VENDOR, MODEL, FIRMWARE, SERIAL, XML_URL = 0x0048, 0x0068, 0x0088, 0x00D8, 0x0200
@@ -28,7 +28,7 @@ DISCOVERY_BYTES = 0xF8
 STREAM_CHANNELS, CAPABILITY, HEARTBEAT_MS, TICK_HIGH, TICK_LOW = 0x0904, 0x0934, 0x0938, 0x093C, 0x0940
 PRIVILEGE, STREAM_PORT, PACKET_SIZE, STREAM_ADDRESS = 0x0A00, 0x0D00, 0x0D04, 0x0D18
 BOOTSTRAP_BYTES = 0x1_0000
-"""Registers of the standard below, the camera's own from here."""
+"""End of the standard's registers; the camera's own begin here."""
 
 _HEADER = struct.Struct(">BBHHH")
 _ANSWER = struct.Struct(">HHHH")
@@ -53,7 +53,7 @@ class Command(IntEnum):
 
 @dataclass(frozen=True, slots=True)
 class Request:
-    """A command as it came."""
+    """A command as received."""
 
     command: int
     number: int
@@ -62,7 +62,7 @@ class Request:
 
 
 def parse(packet: bytes) -> Request | None:
-    """A GVCP command, or None for what is none."""
+    """Decode a GVCP command; return None for any other packet."""
     if len(packet) < _HEADER.size:
         return None
     key, flags, command, length, number = _HEADER.unpack_from(packet)
@@ -71,7 +71,7 @@ def parse(packet: bytes) -> Request | None:
 
 
 def parse_resend(request: Request) -> tuple[int, int, int]:
-    """Number of the frame, first and last packet that the host asks for again."""
+    """Return the number of the frame, and the first and last packet to send again."""
     if request.flags & _EXTENDED_REQUEST:
         first, last, number = struct.unpack(">4xIIQ", request.body[:20])
     else:
@@ -84,7 +84,7 @@ def answer(request: Request, body: bytes) -> bytes:
 
 
 class Registers:
-    """The camera's address space, and what control commands do to it."""
+    """The camera's address space, and the control commands that act on it."""
 
     def __init__(self, space: bytes, texts: dict[int, str], address: bytes) -> None:
         self.memory = bytearray(BOOTSTRAP_BYTES) + bytearray(space)
@@ -104,7 +104,7 @@ class Registers:
         struct.pack_into(">I", self.memory, at, value)
 
     def handle(self, request: Request) -> bytes | None:
-        """The answer to a command; None for one that is not served."""
+        """Carry out a command and return its answer; None if it is not supported."""
         match request.command:
             case Command.DISCOVERY:
                 return answer(request, bytes(self.memory[:DISCOVERY_BYTES]))
@@ -128,7 +128,7 @@ class Registers:
 
 @dataclass(frozen=True, slots=True)
 class Frame:
-    """One block of lines on its way. ``number`` is never 0: 16 bits of it, or 64 in ``extended`` headers."""
+    """One block of lines to send. ``number`` is never 0 and has 16 bits, or 64 in ``extended`` headers."""
 
     number: int
     time_ns: int
@@ -140,7 +140,7 @@ class Frame:
 
 
 def packets(frame: Frame, packet_size: int) -> Iterator[bytes]:
-    """Leader, payload and trailer."""
+    """Yield leader, payload and trailer."""
     size = (_GVSP_EXTENDED if frame.extended else _GVSP).size
     step = packet_size - IP_AND_UDP_BYTES - size
     leader = (0, _IMAGE, frame.time_ns, frame.pixel_format, frame.width, frame.height, 0, 0, 0, 0)

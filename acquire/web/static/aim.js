@@ -1,4 +1,4 @@
-// The first hour of every instrument: one camera large, how sharp it is, how bright, where its light falls.
+// Alignment of a new instrument: one large camera with its sharpness, brightness and light profile.
 
 import { Waterfall } from "./waterfall.js";
 import { $, make, percent } from "./words.js";
@@ -7,12 +7,12 @@ export class Aim {
   #fall; #none = make("p", { className: "none" }); #run = null; #peak = 0; #smooth = null; #shown = new Float64Array(1); #profile; #focus = make("output"); #best = make("output"); #white = make("output");
 
   constructor() {
-    const canvas = make("canvas", { role: "img", "aria-label": "The camera that is aimed" });
+    const canvas = make("canvas", { role: "img", "aria-label": "The selected camera" });
     this.#profile = make("canvas", { className: "histogram", role: "img", "aria-label": "Brightest value of each pixel" });
     this.#fall = new Waterfall(canvas, 480);
     $("aim-view").replaceChildren(make("div", { className: "fall" }, make("div", { className: "scale", "aria-hidden": "true" }, make("span", {}, "−5 s"), make("span", {}, "now")), canvas, this.#none), this.#profile);
     $("aim-numbers").replaceChildren(make("h2", {}, "Focus"), this.#focus, make("h2", {}, "Best so far"), this.#best, make("h2", {}, "Saturated pixels"), this.#white,
-      make("p", { className: "hint" }, "Focus is the contrast between neighbouring pixels of the brightest light, in percent of it. Turn the lens until it falls again, and go back to the best."));
+      make("p", { className: "hint" }, "Focus is the contrast between neighbouring pixels in percent of the light, from the brightest values. Turn the lens until it decreases again, and go back to the best."));
     this.#forget();
     $("aim-arm").addEventListener("change", () => this.#forget());
     $("aim-reset").addEventListener("click", () => this.#forget());
@@ -48,7 +48,7 @@ export class Aim {
     for (const output of [this.#focus, this.#best, this.#white]) output.textContent = "–";
   }
 
-  /** Also with every state: the theme may be another by now. */
+  /** Called with every state, too, since the theme may have changed. */
   #draw() {
     const profile = this.#shown, canvas = this.#profile, width = (canvas.width = canvas.clientWidth || 300), height = (canvas.height = canvas.clientHeight || 70), context = canvas.getContext("2d");
     context.fillStyle = getComputedStyle(canvas).color;

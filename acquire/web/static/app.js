@@ -1,4 +1,4 @@
-// The page: who is there, which screen, which key; the rest is in the modules.
+// The page: log-in, screens and keys; everything else is in the modules.
 
 import { Aim } from "./aim.js";
 import { Band } from "./band.js";
@@ -33,7 +33,7 @@ async function admitted() {
   screen();
 }
 
-/** What stands behind # is a token, which is taken out of the address at once, or a screen. */
+/** Show the screen named after # in the address. */
 function screen() {
   const asked = location.hash.replace("#/", ""), shown = SCREENS.includes(asked) ? asked : "watch";
   for (const name of SCREENS) $(name).hidden = name !== shown;
@@ -44,11 +44,11 @@ function screen() {
   if (latest) showHealth(latest.status, latest.health, fail, operator);
 }
 
-/** An answer to what was asked before the token may have come after it, and have asked for it once more. */
+/** A late answer to a request from before the log-in may have opened the dialog again: the session closes it. */
 link.addEventListener("begun", () => { if (!setup || $("enter").open) admitted().catch(() => {}); });
 link.addEventListener("locked", () => { if (!$("enter").open) $("enter").showModal(); });
-link.addEventListener("silent", ({ detail }) => stale(`No word from the page's server for ${Math.round(detail)} s.`));
-link.addEventListener("link", ({ detail }) => stale(`The page's server has no daemon: ${detail.header.why}`));
+link.addEventListener("silent", ({ detail }) => stale(`The page's server has not sent anything for ${Math.round(detail)} s.`));
+link.addEventListener("link", ({ detail }) => stale(`The page's server cannot reach the daemon: ${detail.header.why}`));
 link.addEventListener("news", ({ detail }) => {
   watch.news(detail.header.news);
   if (detail.header.news.kind === "reload" && !$("setup").hidden) screen();

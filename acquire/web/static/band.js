@@ -1,4 +1,4 @@
-// What is seen from three metres: a word, a colour, since when, what is left, one sentence, the lost lines.
+// The band that can be read from three metres: state, colour, duration, what is left, a sentence, lost lines.
 
 import { $, count, duration, make } from "./words.js";
 
@@ -14,7 +14,7 @@ export class Band {
     $("acknowledge").addEventListener("click", () => { this.#acknowledged = this.#sticky; this.#lost(); });
   }
 
-  /** `nowMs`: by the clock of the instrument, since this computer's may be another. */
+  /** `nowMs` is the instrument's clock, since this computer's clock may differ. */
   show(status, health, nowMs) {
     delete document.body.dataset.stale;
     if (status.run_id && status.run_id !== this.#run) { this.#run = status.run_id; this.#acknowledged = this.#sticky = 0; }
@@ -27,23 +27,23 @@ export class Band {
     $("state").textContent = WORDS[status.state];
     $("flag").textContent = unseen ? "lines lost" : document.body.dataset.level === "degraded" ? "degraded" : "";
     $("since").textContent = status.busy ? `${status.busy} …` : `for ${duration(Math.max(0, nowMs - Date.parse(status.since)) / 1000)}`;
-    $("sentence").textContent = unseen && !health.lost_lines ? `${count(this.#sticky)} lines were lost in the run before.` : health.sentence;
+    $("sentence").textContent = unseen && !health.lost_lines ? `${count(this.#sticky)} lines were lost in the previous run.` : health.sentence;
     [$("left-label").textContent, $("left").textContent] = left(status);
     $("rig").textContent = status.name;
     document.title = `${WORDS[status.state].toUpperCase()}${unseen ? " – LINES LOST" : ""} · ${status.name}`;
     this.#lost();
-    this.#tell(`${$("state").textContent} ${$("flag").textContent}. ${$("sentence").textContent}`, document.body.dataset.level + status.state);
+    this.#announce(`${$("state").textContent} ${$("flag").textContent}. ${$("sentence").textContent}`, document.body.dataset.level + status.state);
   }
 
-  /** No word from the server, or from the daemon behind it. */
+  /** The server, or the daemon behind it, does not answer. */
   stale(why) {
     document.body.dataset.stale = "";
-    $("state").textContent = "no news";
+    $("state").textContent = "no contact";
     $("flag").textContent = "";
-    $("since").textContent = "what is shown is old";
+    $("since").textContent = "the values shown are old";
     $("sentence").textContent = why;
-    document.title = "NO NEWS · acquire";
-    this.#tell(`No news. ${why}`, "stale");
+    document.title = "NO CONTACT · acquire";
+    this.#announce(`No contact. ${why}`, "stale");
   }
 
   #lost() {
@@ -51,8 +51,8 @@ export class Band {
     $("acknowledge").hidden = this.#sticky <= this.#acknowledged;
   }
 
-  /** Read out when the state changes, not with every number. */
-  #tell(text, key) {
+  /** Let screen readers announce changes of the state, but not of every number. */
+  #announce(text, key) {
     if (key === this.#last) return;
     this.#last = key;
     $("told").replaceChildren(make("span", { className: "read" }, text));
@@ -60,10 +60,10 @@ export class Band {
   }
 }
 
-/** Of the recording's budget, else of the disk. */
+/** Return label and amount of what is left of the recording's budget, or else of the disk. */
 function left(status) {
   const now = status.recording;
   if (now?.budget_lines) return ["left", `${count(Math.max(0, now.budget_lines - now.recorded_lines))} lines`];
   if (now) return ["recorded", `${count(now.recorded_lines)} lines`];
-  return ["room on the disk", status.disk ? duration(status.disk.seconds_to_full) : "–"];
+  return ["space on the disk", status.disk ? duration(status.disk.seconds_to_full) : "–"];
 }

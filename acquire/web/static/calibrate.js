@@ -1,15 +1,15 @@
-// The steps of a calibration: what to put in front of the lens, one button each, what was found and how surely.
+// The steps of a calibration, each with its preparation, a button, and its findings with their uncertainties.
 
 import { ask } from "./link.js";
 import { $, count, day, fill, make } from "./words.js";
 
 const REFRESH_MS = 1000;
 const TITLES = { delay: "Delay", dark: "Dark", linearity: "Linearity", flat: "Flat", target: "Target", psf: "Blur" };
-/** In these states of the daemon a step can have the instrument. */
+/** States of the daemon in which a step can use the instrument. */
 const FREE = ["idle", "armed"];
 
 export class Calibrate {
-  #fail; #operator = null; #status = null; #unknown = ""; #cards = new Map(); #job = null; #timer = null; #steps = []; #told = "";
+  #fail; #operator = null; #status = null; #unknown = ""; #cards = new Map(); #job = null; #timer = null; #steps = []; #shownError = "";
 
   constructor(fail) { this.#fail = fail; }
 
@@ -17,25 +17,25 @@ export class Calibrate {
 
   show(status) { this.#status = status; this.#unknown = ""; this.#enable(); }
 
-  /** What is shown is old: nothing is begun on the strength of it. */
+  /** The state shown is old, so no step can be started. */
   stale(why) { this.#unknown = why; this.#enable(); }
 
-  /** The screen is seen: read what there is, and follow a step that is under way. */
+  /** The screen is opened: read the calibration, and follow a running step. */
   async open() {
     clearTimeout(this.#timer);
     if ($("aim").hidden) return;
     try {
       this.#build(await ask("GET", "calibration"));
       await this.#follow();
-      if (this.#told && $("error").textContent === this.#told) this.#fail("");
-      this.#told = "";
+      if (this.#shownError && $("error").textContent === this.#shownError) this.#fail("");
+      this.#shownError = "";
     } catch (error) { this.#again(error); }
   }
 
-  /** What fails is told, and tried again, until it works: the page's server may just be starting. */
+  /** Show a failure and try again until it works, since the page's server may just be starting. */
   #again(error) {
     if ($("aim").hidden) return;
-    this.#fail(this.#told = error.message);
+    this.#fail(this.#shownError = error.message);
     this.#timer = setTimeout(() => this.open(), REFRESH_MS);
   }
 
@@ -44,15 +44,15 @@ export class Calibrate {
     if ($("aim").hidden) return;
     const [latest] = (await ask("GET", "jobs")).filter((job) => job.kind === "calibrate");
     const was = this.#job, ended = was?.state === "running" && (latest?.id !== was.id || latest.state !== "running");
-    this.#job = latest ?? (ended ? { ...was, state: "failed", text: "the page's server was started anew and the step asked to end" } : was);
+    this.#job = latest ?? (ended ? { ...was, state: "failed", text: "the page's server was restarted, which ended the step" } : was);
     if (ended) this.#build(await ask("GET", "calibration"));
-    this.#tell();
+    this.#showJob();
     if (this.#job?.state === "running") this.#timer = setTimeout(() => this.#follow().catch((error) => this.#again(error)), REFRESH_MS);
   }
 
   #build(facts) {
     this.#steps = facts.steps;
-    $("calibration-place").textContent = facts.error ?? `${facts.path}. ${facts.named ? "The rig names it: every recording gets a copy." : `Recordings get a copy once the rig file says calibration = "${facts.path}".`}`;
+    $("calibration-place").textContent = facts.error ?? `${facts.path}. ${facts.named ? "The rig names it: every recording gets a copy." : `Recordings will get a copy once the rig file sets calibration = "${facts.path}".`}`;
     $("calibration-place").className = facts.error ? "bad" : "hint";
     if (!this.#cards.size) {
       for (const step of facts.steps) this.#cards.set(step.name, new Card(step, (lines) => this.#begin(step.name, lines), () => this.#cancel()));
@@ -64,7 +64,7 @@ export class Calibrate {
 
   async #begin(step, lines) {
     this.#fail("");
-    try { this.#job = await ask("POST", "calibration", lines === null ? { step } : { step, lines }); this.#tell(); await this.#follow(); }
+    try { this.#job = await ask("POST", "calibration", lines === null ? { step } : { step, lines }); this.#showJob(); await this.#follow(); }
     catch (error) { this.#fail(error.message); }
   }
 
@@ -73,20 +73,20 @@ export class Calibrate {
     catch (error) { this.#fail(error.message); }
   }
 
-  #tell() {
+  #showJob() {
     for (const [name, card] of this.#cards) card.follow(this.#job?.step === name ? this.#job : null);
     this.#enable();
   }
 
-  /** Why a step cannot be begun now; nothing where it can. */
+  /** Return why a step cannot be started now; empty if it can. */
   #why(step) {
     if (this.#unknown) return this.#unknown;
     if (this.#operator === null || !this.#status) return "The page is still connecting to the instrument.";
-    if (!this.#operator) return "This token is for looking only.";
-    if (this.#job?.state === "running") return this.#job.step === step.name ? "" : `The step ${TITLES[this.#job.step]} is under way.`;
-    if (!FREE.includes(this.#status.state)) return this.#status.state === "faulted" ? "The instrument has a fault: disarm it first." : "While something is recorded, the instrument is not to be had.";
+    if (!this.#operator) return "Only an operator can do this; you are logged in as a viewer.";
+    if (this.#job?.state === "running") return this.#job.step === step.name ? "" : `The step ${TITLES[this.#job.step]} is running.`;
+    if (!FREE.includes(this.#status.state)) return this.#status.state === "faulted" ? "The instrument has a fault: disarm it first." : "The instrument is recording.";
     const before = this.#steps.find((one) => one.name === step.after);
-    return before && !before.found.length ? `After the step ${TITLES[step.after]}.` : "";
+    return before && !before.found.length ? `The step ${TITLES[step.after]} must be done first.` : "";
   }
 
   #enable() { for (const step of this.#steps) this.#cards.get(step.name).enable(this.#why(step), this.#operator); }
@@ -101,7 +101,7 @@ class Card {
     this.#lines = make("input", { type: "number", id: `lines-${step.name}`, min: step.least_lines, max: 2 ** 20, value: step.lines ?? "", placeholder: step.lines ? String(step.lines) : "automatic", className: "long", inputMode: "numeric" });
     this.#begin = make("button", { className: "primary", id: `begin-${step.name}`, onclick: () => this.#ask(begin) }, `Measure ${title.toLowerCase()}`);
     this.#cancel = make("button", { id: `cancel-${step.name}`, hidden: true, onclick: cancel, "aria-label": `Cancel ${title.toLowerCase()}` }, "Cancel");
-    this.#bar.setAttribute("aria-label", `How far ${title.toLowerCase()} is`);
+    this.#bar.setAttribute("aria-label", `Progress of ${title.toLowerCase()}`);
     this.#why.id = `why-${step.name}`;
     this.#begin.setAttribute("aria-describedby", this.#why.id);
     this.element = make("li", { id: `step-${step.name}` }, make("h3", {}, title, this.#state), make("p", {}, step.prepare),
@@ -133,7 +133,7 @@ class Card {
 
   found(found) {
     const latest = found.map((one) => one.made).sort().at(-1);
-    this.#state.textContent = latest ? `✓ ${day(Date.parse(latest) * 1e6)}` : "not yet";
+    this.#state.textContent = latest ? `✓ ${day(Date.parse(latest) * 1e6)}` : "not done yet";
     this.#state.className = latest ? "good" : "unknown";
     fill(this.#found, JSON.stringify(found), () => found.map((one) => make("div", {}, found.length > 1 ? make("h4", {}, one.name) : null,
       make("dl", {}, ...[["lines", count(one.lines)], ...Object.entries(one.facts)].flatMap(([what, text]) => [make("dt", {}, what), make("dd", {}, text)])),

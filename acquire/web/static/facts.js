@@ -1,4 +1,4 @@
-// Health and Setup: tables of what the daemon says of itself.
+// Health and Setup: tables of the daemon's own reports.
 
 import { ask } from "./link.js";
 import { $, clock, count, duration, fill, make, quantity } from "./words.js";
@@ -15,26 +15,26 @@ export function showHealth(status, health, fail, operator) {
   const capacity = status.capacity;
   const key = JSON.stringify([health, capacity, status.processes, status.uploads, status.recoveries, status.troubles, status.state, operator]);
   fill($("health"), key, () => [make("div", { className: "panels" },
-    wide(panel("Judged by written thresholds", table(["what", "", "now", "thresholds"], health.checks.map((check) =>
+    wide(panel("Checks against fixed thresholds", table(["check", "", "now", "thresholds"], health.checks.map((check) =>
       [check.name, make("span", { className: check.level }, MARKS[check.level]), check.text, check.limit])))),
     panel("What this host sustains", capacity
-      ? make("p", {}, capacity.warning ?? `${quantity(capacity.sustained_hz ?? 0, "lines/s")}; configured are ${quantity(capacity.line_rate_hz, "lines/s")}; the ${capacity.limit} allows least.`)
-      : make("p", {}, "Not measured since the daemon began."),
+      ? make("p", {}, capacity.warning ?? `${quantity(capacity.sustained_hz ?? 0, "lines/s")}; ${quantity(capacity.line_rate_hz, "lines/s")} are configured; the limit is: ${capacity.limit}.`)
+      : make("p", {}, "Not measured since the daemon started."),
     make("button", { id: "measure", disabled: !operator || status.state !== "idle" || Boolean(status.busy), onclick: () => { fail(""); ask("POST", "capacity").catch((error) => fail(error.message)); } }, "Measure now"),
-    make("p", { className: "hint" }, "Only while nothing is armed.")),
-    panel("Processes", table(["name", "number"], [["daemon", String(status.pid)], ...Object.entries(status.processes).map(([name, pid]) => [name, String(pid)])])),
-    panel("Uploads", status.uploads.length ? table(["recording", "state", "lines there", "why"], status.uploads.map((one) => [one.path.split("/").at(-1), one.state, count(one.lines), one.error])) : make("p", {}, "None.")),
+    make("p", { className: "hint" }, "Only while the instrument is idle.")),
+    panel("Processes", table(["name", "PID"], [["daemon", String(status.pid)], ...Object.entries(status.processes).map(([name, pid]) => [name, String(pid)])])),
+    panel("Uploads", status.uploads.length ? table(["recording", "state", "lines uploaded", "reason"], status.uploads.map((one) => [one.path.split("/").at(-1), one.state, count(one.lines), one.error])) : make("p", {}, "None.")),
     panel("Recoveries", status.recoveries.length ? table(["recording", "state", ""], status.recoveries.map((one) => [one.path.split("/").at(-1), one.state, one.text])) : make("p", {}, "None.")),
-    panel("Unforeseen failures", status.troubles.length ? table(["when", "what", "times"], status.troubles.map((one) => [clock(one.last), one.text, String(one.times)])) : make("p", {}, "None.")))]);
+    panel("Unexpected failures", status.troubles.length ? table(["last", "failure", "count"], status.troubles.map((one) => [clock(one.last), one.text, String(one.times)])) : make("p", {}, "None.")))]);
 }
 
 export function showSetup(setup, status) {
   if (!setup) return;
   const key = JSON.stringify([setup.config, setup.versions, status?.pid]);
   fill($("setup"), key, () => [make("div", { className: "panels" },
-    panel("Where it is not the default", make("p", {}, `Rig ${setup.name}, from ${setup.file || "no file"}. To change it, edit the file and start the daemon anew.`),
+    panel("Changes from the defaults", make("p", {}, `Rig ${setup.name}, from ${setup.file || "no file"}. To change it, edit the file and restart the daemon.`),
       table(["key", "value"], Object.entries(setup.changed).map(([name, value]) => [name, JSON.stringify(value)]))),
     panel("Versions", table(["library", "version"], Object.entries(setup.versions))),
-    panel("Lines", table(["", ""], [["rate", quantity(setup.line_rate_hz, "lines/s")], ["period by the trigger", quantity(setup.line_period_ns / 1e9, "s")], ["the rings hold", duration(setup.history_s)]])),
-    panel("All of it", make("pre", { tabIndex: 0 }, JSON.stringify(setup.config, null, 2))))]);
+    panel("Lines", table(["", ""], [["rate", quantity(setup.line_rate_hz, "lines/s")], ["period set by the trigger", quantity(setup.line_period_ns / 1e9, "s")], ["the rings hold", duration(setup.history_s)]])),
+    panel("Complete configuration", make("pre", { tabIndex: 0 }, JSON.stringify(setup.config, null, 2))))]);
 }

@@ -1,9 +1,9 @@
-// What has just passed as a coarse video: its frames over and over until the next glimpse comes.
+// A coarse video of the latest lines: its frames are repeated until the next glimpse arrives.
 
 import { $ } from "./words.js";
 
 const FRAME_MS = 80;
-/** Later than this after the one before, a glimpse is said to be late: its frames go on moving all the same. */
+/** A glimpse is reported as late after this time, while the frames of the previous one are still repeated. */
 const LATE_S = 3;
 
 export class Glimpse {
@@ -35,7 +35,7 @@ export class Glimpse {
   #draw() {
     if (!this.#header) return;
     const late_s = (performance.now() - this.#taken) / 1000;
-    if (late_s > LATE_S) $("glimpse-text").textContent = `${this.#words}; none has come for ${Math.round(late_s)} s`;
+    if (late_s > LATE_S) $("glimpse-text").textContent = `${this.#words}; no new one for ${Math.round(late_s)} s`;
     const { rows, columns, frames } = this.#header, canvas = $("glimpse"), size = rows * columns, image = new ImageData(columns, rows);
     const bytes = this.#body.subarray(this.#frame * size, (this.#frame + 1) * size);
     for (let i = 0; i < size; i++) image.data.set([bytes[i], bytes[i], bytes[i], 255], 4 * i);

@@ -1,19 +1,19 @@
-// One stream from the page's server: state, news and rows. It is opened again for ever, and silence is told.
+// One stream from the page's server: state, news and rows. It is always reopened, and silence is reported.
 
 const decoder = new TextDecoder();
 export const SILENT_MS = 2000;
-/** A connection that has been silent for so long may be one of which only this end is left: another one is made. */
+/** A connection that is silent for this long may be dead at the other end, and is replaced. */
 const DEAD_MS = 8000;
-/** The longest command is a recording that is sealed on a slow disk. */
+/** The longest command seals a recording on a slow disk. */
 const ANSWER_MS = 600000;
-/** A hidden page asks so often, and browsers let it ask once a minute: its title may be as old. */
+/** A hidden page polls at this interval. Browsers may limit it to once a minute, so its title may be that old. */
 const HIDDEN_MS = 1500, HIDDEN_SILENT_MS = 65000;
 
 /** Split a stream of bytes into messages: see acquire/web/frames.py. */
 export class Messages {
   #rest = new Uint8Array(0);
 
-  /** The messages that are complete with these bytes, as [header, body]. */
+  /** Return the messages that these bytes complete, as [header, body]. */
   take(bytes) {
     const all = new Uint8Array(this.#rest.length + bytes.length);
     all.set(this.#rest); all.set(bytes, this.#rest.length);
@@ -36,7 +36,7 @@ export class Link extends EventTarget {
   #opened = performance.now();
   glimpses = false;
 
-  /** Follow for ever. A hidden page asks now and then, since browsers have six connections for all their tabs. */
+  /** Follow the stream forever. A hidden page only polls, since a browser's tabs share six connections. */
   async run() {
     let shown = () => {};
     document.addEventListener("visibilitychange", () => { this.#abort?.abort(); shown(); });
@@ -48,7 +48,7 @@ export class Link extends EventTarget {
     }
   }
 
-  /** Coarse videos of what has just passed, or not: the stream is opened anew. */
+  /** Switch coarse videos of the latest lines on or off, which reopens the stream. */
   wantGlimpses(wanted) { this.glimpses = wanted; this.#abort?.abort(); }
 
   async #follow() {
@@ -77,7 +77,7 @@ export class Link extends EventTarget {
   }
 }
 
-/** Ask the API; throws an Error in the server's words. */
+/** Call the API. Throws an Error with the server's message. */
 export async function ask(method, path, body) {
   const headers = { "Request-Id": `${Date.now()}-${Math.random().toString(36).slice(2)}` };
   if (body !== undefined) headers["Content-Type"] = "application/json";

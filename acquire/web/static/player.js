@@ -1,4 +1,4 @@
-// A video frame by frame: read in batches of 8-bit frames, drawn to a canvas; frames not sampled in full are marked.
+// A video player: frames are read in batches of 8-bit frames and drawn to a canvas; untrusted frames are marked.
 
 import { ask } from "./link.js";
 import { $, count, make, quantity } from "./words.js";
@@ -16,7 +16,7 @@ export class Player {
     let video;
     try { video = await ask("GET", `videos/${encodeURIComponent(name)}`); }
     catch (error) { this.#fail(error.message); return; }
-    if (asked !== this.#asked) return;  // another one was opened meanwhile
+    if (asked !== this.#asked) return;  // another video was opened in the meantime
     this.#batches.clear();
     this.#video = video;
     this.#canvas = make("canvas", { width: video.columns, height: video.rows, role: "img", "aria-label": name });
@@ -25,7 +25,7 @@ export class Player {
     this.#play = make("button", { id: "play", onclick: () => this.toggle() }, "Play");
     this.#speed = make("select", { "aria-label": "Frames per second" }, ...[5, 12, 25, 50].map((fps) => make("option", { selected: fps === 25, value: fps }, `${fps} frames/s`)));
     $("player").replaceChildren(make("h2", {}, name), this.#canvas, this.#slider, this.#text, make("div", { className: "fields" },
-      make("button", { "aria-label": "One frame back", id: "back", onclick: () => this.step(-1) }, "◀"), this.#play, make("button", { "aria-label": "One frame on", id: "on", onclick: () => this.step(1) }, "▶"), this.#speed));
+      make("button", { "aria-label": "Previous frame", id: "back", onclick: () => this.step(-1) }, "◀"), this.#play, make("button", { "aria-label": "Next frame", id: "on", onclick: () => this.step(1) }, "▶"), this.#speed));
     await this.#show(0);
     this.#canvas.scrollIntoView({ block: "nearest" });
   }
@@ -62,7 +62,7 @@ export class Player {
     this.#frame = frame;
     this.#slider.value = frame;
     const trusted = !video.trusted || (frame >= video.trusted[0] && frame < video.trusted[1]);
-    this.#text.textContent = `Frame ${count(frame + 1)} of ${count(video.frames)}, ${quantity((frame * video.interval_ns) / 1e9, "s")} after the first${trusted ? "" : " – not sampled in full: not to be trusted"}`;
+    this.#text.textContent = `Frame ${count(frame + 1)} of ${count(video.frames)}, ${quantity((frame * video.interval_ns) / 1e9, "s")} after the first${trusted ? "" : " – not trusted, because it was not sampled in full"}`;
     this.#text.className = trusted ? "" : "warning";
   }
 
@@ -71,7 +71,7 @@ export class Player {
     const answer = await fetch(`/api/videos/${encodeURIComponent(video.name)}/frames?first=${batch * BATCH}&count=${BATCH}`);
     if (!answer.ok) throw new Error((await answer.json()).message);
     const frames = new Uint8Array(await answer.arrayBuffer());
-    if (video !== this.#video) return;  // they are another one's
+    if (video !== this.#video) return;  // the frames belong to another video
     this.#batches.set(batch, frames);
     while (this.#batches.size > MOST_BATCHES) this.#batches.delete(this.#batches.keys().next().value);
   }

@@ -1,4 +1,4 @@
-// Recordings: a list with pictures, one of them in full with its time line, cut, hold, reconstruct as a job.
+// Recordings: a list with pictures, and one in detail with its time line, to cut, hold or reconstruct.
 
 import { ask } from "./link.js";
 import { Player } from "./player.js";
@@ -7,7 +7,7 @@ import { $, count, day, duration, fill, make, quantity } from "./words.js";
 const REFRESH_MS = 3000;
 
 export class Recordings {
-  #fail; #operator = false; #chosen = null; #detail = null; #from = 0; #lines = 0; #player; #timer = null; #looking = false; #told = "";
+  #fail; #operator = false; #chosen = null; #detail = null; #from = 0; #lines = 0; #player; #timer = null; #refreshing = false; #shownError = "";
 
   constructor(fail) { this.#fail = fail; this.#player = new Player(fail); }
 
@@ -17,17 +17,17 @@ export class Recordings {
 
   key(key) { return this.#player.key(key); }
 
-  /** One look at a time: a slow disk must not have them pile up. What failed is told until it works again. */
+  /** One refresh at a time, so that they do not pile up on a slow disk. A failure is shown until one succeeds. */
   async #refresh() {
-    if (this.#looking) return;
-    this.#looking = true;
+    if (this.#refreshing) return;
+    this.#refreshing = true;
     try {
       const [recordings, jobs, videos] = await Promise.all([ask("GET", "recordings"), ask("GET", "jobs"), ask("GET", "videos")]);
       this.#list(recordings); this.#jobs(jobs); this.#videos(videos);
-      if (this.#told && $("error").textContent === this.#told) this.#fail("");
-      this.#told = "";
-    } catch (error) { this.#fail(this.#told = error.message); }
-    finally { this.#looking = false; }
+      if (this.#shownError && $("error").textContent === this.#shownError) this.#fail("");
+      this.#shownError = "";
+    } catch (error) { this.#fail(this.#shownError = error.message); }
+    finally { this.#refreshing = false; }
   }
 
   #list(recordings) {
@@ -47,7 +47,7 @@ export class Recordings {
     let detail;
     try { detail = await ask("GET", `recordings/${encodeURIComponent(name)}`); }
     catch (error) { this.#fail(error.message); return; }
-    if (this.#chosen !== name) return;  // another one was chosen meanwhile
+    if (this.#chosen !== name) return;  // another recording was chosen in the meantime
     this.#detail = detail;
     this.#from = this.#detail.first_line;
     this.#lines = Math.min(this.#detail.lines, 512);
@@ -65,7 +65,7 @@ export class Recordings {
     $("detail").replaceChildren(make("h2", {}, one.name), make("dl", {},
       ...[["Lines", `${count(one.lines)}, from ${count(one.first_line)} on, at ${quantity(one.line_rate_hz, "lines/s")}`], ["Condition", `${one.condition ?? one.state}${one.end_reason ? `, ${one.end_reason}` : ""}`], ["Lost", Object.entries(one.lost_lines).map(([arm, n]) => `${arm.toUpperCase()} ${count(n)}`).join(", ")], ["Damage", one.damage ?? "none that shows"]]
         .flatMap(([term, text]) => [make("dt", {}, term), make("dd", {}, text)])),
-      make("p", { className: "hint" }, "Drag over the time line to choose a stretch, or click an event."), strip.element,
+      make("p", { className: "hint" }, "Drag over the time line to select a range, or click an event."), strip.element,
       make("ul", { className: "fields", "aria-label": "Events" }, ...one.event_list.slice(-12).map((event) => make("li", {}, make("button", { onclick: () => strip.choose(Math.max(one.first_line, event.line - 128), 256) }, `${event.kind}${event.text ? `: ${event.text}` : ""}`)))),
       make("div", { className: "fields" }, make("label", {}, "From line ", first), make("label", {}, "Lines ", lines), make("label", {}, "Voxel side ", side), make("label", {}, "Sub-steps ", time), make("label", {}, "Preset ", preset)),
       make("div", { className: "fields" }, make("button", { className: "primary", id: "reconstruct", disabled: off, onclick: job("reconstruct") }, "Reconstruct"), make("button", { id: "preview", disabled: off, onclick: job("preview") }, "Preview"),
@@ -74,7 +74,7 @@ export class Recordings {
   }
 
   #strip(one, first, lines) {
-    const canvas = make("canvas", { role: "img", "aria-label": `${one.event_list.length} events, ${one.gap_list.length} gaps, ${one.hold_list.length} held stretches` }), element = make("div", { className: "strip" }, canvas);
+    const canvas = make("canvas", { role: "img", "aria-label": `${one.event_list.length} events, ${one.gap_list.length} gaps, ${one.hold_list.length} held ranges` }), element = make("div", { className: "strip" }, canvas);
     const draw = () => {
       const width = (canvas.width = element.clientWidth || 600), height = (canvas.height = element.clientHeight || 88), context = canvas.getContext("2d");
       const x = (line) => ((line - one.first_line) / Math.max(1, one.lines)) * width;
@@ -105,7 +105,7 @@ export class Recordings {
   #jobs(jobs) {
     fill($("jobs"), JSON.stringify([jobs, this.#operator]), () => jobs.length ? jobs.map((job) => make("li", {},
       make("b", { className: job.state === "failed" ? "bad" : job.state === "done" ? "good" : "" }, job.state), ` ${job.step ? `${job.kind} ${job.step}` : `${job.kind} of ${job.recording}, ${count(job.lines)} lines from ${count(job.first_line)}`}`, job.text ? make("small", {}, job.text) : null,
-      job.state === "running" && job.total ? make("progress", { max: job.total, value: job.done, "aria-label": `How far job ${job.id} is` }) : null,
+      job.state === "running" && job.total ? make("progress", { max: job.total, value: job.done, "aria-label": `Progress of job ${job.id}` }) : null,
       job.result?.endsWith(".npz") ? make("a", { href: `/api/cuts/${encodeURIComponent(job.result)}`, download: job.result }, job.result) : null,
       ["waiting", "running"].includes(job.state) ? make("button", { id: `stop-${job.id}`, disabled: !this.#operator, "aria-label": `Stop job ${job.id}`, onclick: () => ask("DELETE", `jobs/${job.id}`).then(() => this.#refresh(), (error) => this.#fail(error.message)) }, "Stop") : null)) : [make("li", {}, "None.")]);
   }

@@ -1,4 +1,4 @@
-// The screen that is watched: both arms, the commands, where the lines went, what happened.
+// The main screen: both arms, the commands, the ledger of the lines, and the events.
 
 import { ask } from "./link.js";
 import { Histogram, SHOWN_S, Waterfall } from "./waterfall.js";
@@ -53,7 +53,7 @@ export class Watch {
     this.#ledger(status);
   }
 
-  /** What is shown is old: no command is given on the strength of it. */
+  /** The state shown is old, so no command can be given. */
   stale(why) { this.#unknown = why; this.#possible = new Set(); this.#enable(); }
 
   key(key) {
@@ -65,12 +65,12 @@ export class Watch {
     return true;
   }
 
-  /** A button that cannot be pressed is seen; a key that does nothing is not. */
+  /** Explain why a key has no effect; a disabled button shows that by itself. */
   #refuse(command) {
     const { state, busy, possible } = this.#status ?? {};
     const why = this.#unknown ? `: ${this.#unknown}` : busy ? ` while the daemon is busy: ${busy}`
       : !possible.includes(command) ? ` while ${state}; possible: ${possible.join(", ")}`
-        : `: ${this.#operator === null ? "the page does not know yet who is there" : "this token is for looking only"}`;
+        : `: ${this.#operator === null ? "the log-in is not complete yet" : "you are logged in as a viewer"}`;
     this.#refused = { command, text: `cannot ${command}${why}` };
     this.#fail(this.#refused.text);
   }
@@ -114,7 +114,7 @@ export class Watch {
     const past = Object.values(status.arms).map((arm) => arm.ring.history / arm.ring.slots), facts = [];
     const history = this.#setup && past.length ? Math.min(this.#setup.history_s, Math.min(...past) * this.#setup.history_s * (4 / 3)) : null;
     facts.push(["Recording", status.recording ? `${name(status.recording.path)}, ${count(status.recording.recorded_lines)} lines, ${count(status.recording.committed_lines)} readable` : "–"]);
-    facts.push(["Pre-trigger", history === null ? "–" : `${history.toFixed(1)} s can be had now`]);
+    facts.push(["Pre-trigger", history === null ? "–" : `${history.toFixed(1)} s available now`]);
     facts.push(["Trigger", status.trigger ? `${status.trigger.answers ? "answers" : `SILENT for ${duration(status.trigger.silent_s)}`}, ${count(status.trigger.pulses)} lines` : "–"]);
     facts.push(["Disk", status.disk ? `${quantity(status.disk.free_bytes, "B")} free, full in ${duration(status.disk.seconds_to_full)}` : "–"]);
     facts.push(["Last", status.last ? `${name(status.last.path)}, ${count(status.last.lines)} lines, ${status.last.condition ?? "not sealed"}` : "–"]);
@@ -124,7 +124,7 @@ export class Watch {
 
   #ledger(status) {
     const arms = Object.entries(status.arms), causes = [...new Set(arms.flatMap(([, arm]) => Object.keys(arm.lost)))];
-    const rows = [["issued", "issued"], ["preroll", "pre-roll"], ["stored", "stored"], ["discarded", "in no recording"], ["waiting", "in the ring"], ["pending", "on the way"]];
+    const rows = [["issued", "issued"], ["preroll", "pre-roll"], ["stored", "stored"], ["discarded", "not recorded"], ["waiting", "in the ring"], ["pending", "in transit"]];
     const cells = [...rows.map(([key, text]) => [text, ...arms.map(([, arm]) => (arm.ledger ? count(arm.ledger[key]) : "–")), false]),
       ...causes.map((cause) => [`lost: ${cause.replaceAll("_", " ")}`, ...arms.map(([, arm]) => count(arm.lost[cause] ?? 0)), arms.some(([, arm]) => arm.lost[cause])])];
     fill($("ledger"), JSON.stringify(cells), () => arms.length
@@ -168,7 +168,7 @@ class Arm {
     this.saturated = arm.saturated_part;
   }
 
-  /** Twice a second: what changes faster cannot be read. */
+  /** Called twice a second, since numbers that change faster cannot be read. */
   draw() {
     const { median, saturated } = this.#histogram.draw();
     if (median === null) { this.#level.textContent = ""; return; }

@@ -16,7 +16,7 @@ export class Waterfall {
 
   clear() { this.#columns = 0; this.#next = null; this.canvas.width = 1; this.canvas.height = 1; }
 
-  /** Rows of a message: `header.rows` of `header.columns`, kinds first, then low, then high values. */
+  /** Add the rows of a message: `header.rows` × `header.columns`, first kinds, then low, then high values. */
   add(header, body) {
     const { rows, columns, first } = header;
     if (columns !== this.#columns) this.#begin(columns);
@@ -31,7 +31,7 @@ export class Waterfall {
 
   #begin(columns) {
     this.#columns = columns;
-    this.margin = Math.max(1, Math.round(columns / 100));  // says of each row what it is
+    this.margin = Math.max(1, Math.round(columns / 100));  // a strip that marks the kind of each row
     this.canvas.width = columns + this.margin; this.canvas.height = this.#height;
     this.#merge = { values: new Uint8Array(columns), kind: 0, count: 0, seen: false };
     this.ready = [];
@@ -66,7 +66,7 @@ export class Waterfall {
   }
 }
 
-/** The last second's values: logarithmic bars, the saturated one coloured, and the numbers in words. */
+/** Histogram of the last second: logarithmic bars, with the saturated one coloured. */
 export class Histogram {
   #sums = []; #canvas;
 
@@ -79,7 +79,7 @@ export class Histogram {
 
   clear() { this.#sums = []; this.draw(); }
 
-  /** Median as a share of the range, and the share of saturated pixels. */
+  /** Draw, and return the median as a fraction of the range and the fraction of saturated pixels. */
   draw() {
     const bins = new Float64Array(64);
     let saturated = 0, total = 0;

@@ -1,8 +1,8 @@
-// Numbers as people read them, and elements as programs make them: text only, never markup of strangers.
+// Numbers for people, and elements from text only, so that foreign text can never become markup.
 
 export const $ = (id) => document.getElementById(id);
 
-/** An element with properties and children; strings become text. */
+/** Return an element with properties and children; strings become text. */
 export function make(name, properties = {}, ...children) {
   const element = document.createElement(name);
   for (const [key, value] of Object.entries(properties)) {
@@ -14,8 +14,8 @@ export function make(name, properties = {}, ...children) {
 }
 
 /**
- * Replace what is below an element, only where its text changes: a list that is read out stays where it is.
- * What had the focus has it again, if it has an id: who works by key is not sent to the beginning of the page.
+ * Replace an element's children only if its key changes, so that a screen reader keeps its place in a list.
+ * A focused child with an id is focused again, so that keyboard users do not lose their place.
  */
 export function fill(element, key, build) {
   if (element.dataset.key === key) return;

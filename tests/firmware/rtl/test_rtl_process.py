@@ -133,10 +133,10 @@ def test_without_a_compiler_the_rig_says_what_to_install(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     monkeypatch.setenv("PATH", str(tmp_path))
-    with pytest.raises(UsageError, match=r"there is no g\+\+ \(Debian, Ubuntu: apt install g\+\+\)"):
+    with pytest.raises(UsageError, match=r"which needs g\+\+ \(Debian, Ubuntu: apt install g\+\+\)"):
         RtlTransport(CLOCK_HZ)
     monkeypatch.setattr(acquire.sim.rtl, "ROOT", tmp_path)
-    with pytest.raises(UsageError, match="lies in the checkout"):
+    with pytest.raises(UsageError, match="which are in a checkout"):
         RtlTransport(CLOCK_HZ)
 
 
