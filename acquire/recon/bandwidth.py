@@ -5,9 +5,10 @@ cannot represent spreads evenly over all coefficients, so that their upper half 
 floor; the bandwidth ends with the last coefficient that rises above it, plus a margin. A scene whose light
 reaches into the upper half shows by peaks there; then the whole quarter is used.
 
-On a large sensor a coarse voxel covers many pixels, and a lamp of a few thousand hertz drowns in a floor that
-is so high. A lamp of steady rhythm stands out in the covariance of the lines (`lamps`) on sensors of any
-size, and there the bandwidth reaches at least to the fastest of them.
+A lamp of a few thousand hertz can drown in that floor, with some codes, and with all on a large sensor, where
+a coarse voxel covers many pixels. A lamp of steady rhythm stands out in the covariance of the lines (`lamps`)
+on sensors of any size, and the bandwidth reaches at least to the fastest of them. On a small sensor this is
+searched only if the coarse voxels show fast light at all: what moves in a slow scene passes for a lamp.
 """
 
 from __future__ import annotations
@@ -37,8 +38,7 @@ if TYPE_CHECKING:
 COARSE_SIDE = 24
 HELD_BY = 3
 """Largest number of stages across a coarse voxel for which the floor is low enough without a search for lamps
-(M = 72). There, of six codes of blinking lamps within 12 s, one gained 6.6 dB by the search and one lost 3.4,
-and scenes without lamps lost up to 0.5 by the seconds it takes and by wider bands than they need."""
+(M = 72) in a slow scene: there it took a bullet and a runner for lamps."""
 ITERATIONS, FEWEST_ITERATIONS = 12, 10
 PEAK = 25.0
 """Largest ratio of the floor's highest coefficient to its median: 5 to 15 for a floor, more for light."""
@@ -73,7 +73,8 @@ def estimate_coefficients(
     last = _end_of_signal(np.square(theta, dtype=np.float64).sum((1, 2)))
     # a criterion that needs no truth: the size of the coarse voxels relative to those they stand for
     held = merge <= max(spatial_merge, HELD_BY * segment.geometry.substeps)
-    if not held and affords(search_seconds(segment.geometry, temporal_merge, LARGEST_SHARE)):
+    slow = MARGIN * last <= FEWEST_COEFFICIENTS
+    if not (held and slow) and affords(search_seconds(segment.geometry, temporal_merge, LARGEST_SHARE)):
         last = max(last, last_lamp(segment, problem, temporal_merge, LARGEST_SHARE, hurry))
     return int(np.clip(MARGIN * last, FEWEST_COEFFICIENTS, most))
 

@@ -20,7 +20,7 @@ from acquire.recon.band import band_operator
 from acquire.recon.bandwidth import FEWEST_COEFFICIENTS, MARGIN, estimate_coefficients, light_beyond
 from acquire.recon.basis import TemporalBasis, resized
 from acquire.recon.estimates import InBand, Refined
-from acquire.recon.patterns import ROUND, Refinement, find_patterns
+from acquire.recon.patterns import ROUND, Patterns, Refinement, find_patterns
 
 if TYPE_CHECKING:
     from acquire.arrays import Array
@@ -61,6 +61,14 @@ LEAST_GAIN = 0.003
 """Smallest relative gain of the held-out prediction for which a round counts as an improvement."""
 PATIENCE = 6
 """Number of rounds without improvement that end a refinement."""
+TRIAL_ROUNDS = 2
+"""Number of rounds after which superfluous patterns are recognised."""
+LOOSENED_IN_VAIN = 3
+"""Number of rounds without improvement after which λ is no longer lowered: noise is being fitted."""
+TIGHTER = 2.0
+"""λ from then on, relative to that of the best round, which lagged behind the λ that it was given."""
+LEAST_GAIN_HELD = 5e-4
+"""`LEAST_GAIN` from then on: next to the noise, what is still gained is small."""
 
 
 def solve_in_cosines(
@@ -188,24 +196,59 @@ def _in_patterns(
         return None
     basis = TemporalBasis(first.basis.frames, first.basis.count, problem.arrays)
     merges = (options.spatial_merge, options.temporal_merge)
-    refinement = Refinement(segment, problem, basis, found, merges)
+    refinement = _with_needed_patterns(
+        Refinement(segment, problem, basis, found, merges), problem, found, clock
+    )
     best, kept, idle = np.inf, refinement.found, 0
+    best_weight, held_best, recent = refinement.parameters.tv_weight, np.inf, np.inf
     for _ in clock.run(clock.iterations - clock.done, "refine", video=refinement.video):
+        weight = refinement.parameters.tv_weight
         refinement.step()
         if not refinement.at_round_end:
             continue
         error = problem.prediction_error(refinement.predict())
         # without held-out samples the error is NaN, which never counts as idle
-        idle = idle + 1 if error >= (1 - LEAST_GAIN) * best else 0
+        least_gain = LEAST_GAIN if refinement.loosens else LEAST_GAIN_HELD
+        idle = idle + 1 if error >= (1 - least_gain) * recent else 0
+        recent = min(recent, error)
         if not error >= best:
-            best, kept = error, refinement.found
-        if idle == PATIENCE:
+            best, kept, best_weight = error, refinement.found, weight
+        if refinement.loosens and idle == LOOSENED_IN_VAIN:
+            held_best = recent
+            refinement.hold(TIGHTER * best_weight)
+        elif idle == PATIENCE and not refinement.loosens and recent < (1 - LEAST_GAIN) * held_best:
+            held_best = recent
+            refinement.hold(weight / TIGHTER)
+        elif idle == PATIENCE:
             clock.converged()
             break
+        else:
+            continue
+        recent, idle = np.inf, 0
     refinement.return_to(kept)
     if problem.prediction_error(first.predict()) < best < np.inf:
         return None
     return Refined(refinement, basis.count)
+
+
+def _with_needed_patterns(
+    refinement: Refinement, problem: Problem, found: Patterns, clock: IterationClock
+) -> Refinement:
+    """The refinement after a few rounds, or one with fewer patterns if it predicts better after as many.
+
+    The first look tells patterns from its own errors by their energy alone, and may find too many.
+    """
+
+    def refined(start: Refinement) -> tuple[float, Refinement]:
+        for _ in clock.run(TRIAL_ROUNDS * ROUND, "refine", video=start.video):
+            start.step()
+        return problem.prediction_error(start.predict()), start
+
+    error, refinement = refined(refinement)
+    if not error < np.inf or (rank := refinement.needed_rank) == refinement.rank:
+        return refinement
+    fewer = Patterns(found.curves[:, :rank], found.patterns[:rank])
+    return min((error, refinement), refined(refinement.restarted(fewer)), key=lambda each: each[0])[1]
 
 
 def find_band(segment: Segment, problem: Problem, options: SolveOptions, clock: IterationClock) -> int:

@@ -1,6 +1,6 @@
-"""The light curves of known patterns, from all lines by least squares.
+"""The light curves of known patterns, from all lines: least squares with a prior that the lines choose.
 
-    y = Σ_k Λ·(u_k ⊗ Z_k),     u_k = Dᵀ·(column k of the unknown),     no prior on the amplitudes
+    minimise  ‖y − Σ_k Λ·(u_k ⊗ Z_k)‖²/σ² + Σ_{c,k} x_{ck}²/γ_c,     u_k = Dᵀ·x_k
 
 Line i is Σ_{k,s} E(iS + s)·u_k(iS + s)·P_k(s), with P_k the pattern's rows summed over S steps. The system is
 small, R·K unknowns for all samples, but the sum over n steps attenuates fast light: plain conjugate gradients
@@ -8,16 +8,20 @@ need hundreds of steps. With all samples in use the normal matrix is known in cl
 
     G[t, k; t', k'] = E(t)·E(t')·Σ_i Q_{kk'}(t − iS, t' − iS),     Q_{kk'} = P_k·P_{k'}ᵀ of both arms
 
-and with its Cholesky factor as preconditioner a few steps are enough if some samples are masked.
+and with its inverse as preconditioner a few steps are enough if some samples are masked.
+
+Without a prior, noise and the errors of the patterns go into the cosines that the lines hardly determine: the
+curves of fast lamps lose their amplitude. γ_c, the energy of cosine c, is shared by the patterns, so that it
+means the same however they are rotated; it and the noise σ² are those for which the lines are most likely
+(the evidence, MacKay, Neural Comput. 4, 415 (1992)). On lines without noise the prior fades out.
 """
 
 from __future__ import annotations
 
-from functools import partial
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from scipy.linalg import cho_factor, cho_solve
 
 from acquire.arrays import dot, host
 from acquire.forward import blurring, column_merging, registration
@@ -27,7 +31,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from acquire.arrays import Array, Arrays
+    from acquire.arrays import Array
     from acquire.lines import Segment
     from acquire.recon.basis import TemporalBasis
     from acquire.recon.problem import Problem
@@ -37,10 +41,30 @@ RIDGE = 1e-5
 STEPS = 6
 PLAIN_STEPS = 60
 REFRESH = 4
-"""Number of calls that share a preconditioner."""
+"""Number of calls that share a preconditioner and a prior."""
+EVIDENCE_STEPS = 2
+"""Number of fixed-point steps of the prior in such a call; it converges over the calls."""
+FAINTEST = 1e-10
+"""Smallest energy of a cosine relative to the largest: below it, the cosine would never come back."""
+LEAST_DETERMINED = 0.01
+"""Smallest share of an unknown that counts as determined by the lines; it bounds a step of its energy."""
 LARGEST_SPAN = 8192
 """Largest number of sub-steps for which the normal matrix is formed; it would take too much memory beyond."""
 LARGEST_UNKNOWNS = 4096
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CurvePrior:
+    """Independent normal curves: the energy γ (K,) of each cosine, and the noise σ² of the samples."""
+
+    energy: NDArray[np.float64]
+    noise: float
+
+    @property
+    def precision(self) -> NDArray[np.float64]:
+        """σ²/γ (K, 1), what the prior adds to the diagonal of the normal matrix."""
+        precision: NDArray[np.float64] = self.noise / np.maximum(self.energy, FAINTEST * self.energy.max())
+        return precision[:, None]
 
 
 class CurveFit:
@@ -58,16 +82,19 @@ class CurveFit:
         cosines: TemporalBasis,
         temporal_merge: int,
         ridge: float = RIDGE,
+        *,
+        learns: bool = False,
     ) -> None:
-        """Set up the fit.
+        """Set up the fit; one that ``learns`` has a prior, which it finds from the lines.
 
         Light to which the lines respond less than ``ridge``, relative to the mean eigenvalue, hardly changes
         in one call: the larger the error of the patterns, the larger it should be.
         """
         self._segment, self._problem, self._cosines = segment, problem, cosines
-        self._merge, self._ridge, self._calls = temporal_merge, ridge, 0
+        self._merge, self._ridge, self._learns, self._calls = temporal_merge, ridge, learns, 0
         self._precondition: Callable[[Array], Array] = lambda x: x
         self._damping = 0.0
+        self.prior: CurvePrior | None = None
 
     def __call__(self, patterns: Array, start: NDArray[Any]) -> NDArray[np.float64]:
         """Fit curves (K, R) to the samples with ``patterns`` (R, n, n), near ``start``.
@@ -78,19 +105,62 @@ class CurveFit:
         whole = CurveOperator(self._segment, patterns, self._cosines, self._merge)
         operator = self._problem.masked(whole)
         residual = self._problem.used_samples - operator.forward(arrays.asarray(start))
+        gradient = host(exact.asarray(operator.adjoint(residual)))
         small = self._segment.geometry.span <= LARGEST_SPAN and start.size <= LARGEST_UNKNOWNS
         if small and self._calls % REFRESH == 0:
-            gram = whole.gram() / self._problem.norm**2
-            self._precondition, self._damping = _preconditioner(gram, start.shape, self._ridge, arrays)
+            self._prepare(host(whole.gram()), start, gradient, float(dot(residual, residual)))
         self._calls += 1
+        precision = np.zeros((1, 1)) if self.prior is None else self.prior.precision
+        damping = exact.asarray(self._damping + precision)
 
         def normal(x: Array) -> Array:
-            return exact.asarray(operator.adjoint(operator.forward(arrays.asarray(x)))) + self._damping * x
+            return exact.asarray(operator.adjoint(operator.forward(arrays.asarray(x)))) + damping * x
 
-        right = exact.asarray(operator.adjoint(residual))
+        right = exact.asarray(gradient - precision * start)
         change = _conjugate_gradients(normal, right, self._precondition, STEPS if small else PLAIN_STEPS)
         fitted: NDArray[np.float64] = start + host(change)
         return fitted
+
+    def _prepare(
+        self, gram: NDArray[np.float64], start: NDArray[Any], gradient: NDArray[Any], energy: float
+    ) -> None:
+        """Update damping, preconditioner and, if the fit learns, its prior.
+
+        ``gram`` is the normal matrix of all samples before their scaling, ``gradient`` (K, R) the adjoint of
+        the residual of ``start``, ``energy`` the sum of its squares. The lines determine a share of each
+        unknown, 1 − σ²/γ·(G + σ²/γ)⁻¹ on the diagonal: a cosine's energy is its mean square over that share,
+        and the noise is the residual's over the samples that no unknown takes up.
+        """
+        cosines, rank = start.shape
+        samples = np.count_nonzero(self._problem.weight)
+        gram *= samples / self._problem.weight.size / self._problem.norm**2
+        self._damping = max(self._ridge * float(np.trace(gram)) / len(gram), float(np.finfo(np.float32).tiny))
+        before, slope = start.T.ravel().astype(np.float64), gradient.T.ravel().astype(np.float64)
+        if self._learns and self.prior is None and start.any():
+            self.prior = CurvePrior(np.square(start, dtype=np.float64).mean(1), energy / samples)
+        diagonal = np.diag_indices_from(gram)
+        for _ in range(EVIDENCE_STEPS if self._learns else 1):
+            added = np.zeros(len(gram)) if self.prior is None else np.tile(self.prior.precision[:, 0], rank)
+            matrix = gram.copy()
+            matrix[diagonal] += self._damping + added
+            inverse = np.linalg.inv(matrix)
+            if not self._learns:
+                break
+            change = inverse @ (slope - added * before)
+            determined = np.clip(1 - added * np.diag(inverse), LEAST_DETERMINED, 1)
+            left = energy - 2 * float(change @ slope) + float(change @ gram @ change)
+            self.prior = CurvePrior(
+                (np.square(before + change) / determined).reshape(rank, cosines).mean(0),
+                max(left, FAINTEST * energy) / max(samples - determined.sum(), 1.0),
+            )
+        exact = self._problem.arrays.exact()
+        solver = exact.asarray(inverse)
+
+        def solve(right: Array) -> Array:
+            flat = exact.xp.reshape(right.T, (-1,))
+            return exact.xp.reshape(exact.xp.matmul(solver, flat), (rank, cosines)).T
+
+        self._precondition = solve
 
 
 class CurveOperator:
@@ -168,28 +238,6 @@ class CurveOperator:
             frames = xp.reshape(xp.concat([light, dark]), (-1, self._merge, light.shape[1]))
             light = xp.sum(frames, axis=1)
         return self._matrix @ light
-
-
-def _preconditioner(
-    gram: Array, shape: tuple[int, ...], ridge: float, arrays: Arrays
-) -> tuple[Callable[[Array], Array], float]:
-    """Solver of (G + damping)·x = b for x, b of ``shape`` (K, R), and the damping.
-
-    The array API standard has no triangular solver: the inverse replaces it on other devices than the host.
-    """
-    xp, count = arrays.xp, gram.shape[0]
-    damping = max(ridge * float(xp.linalg.trace(gram)) / count, float(np.finfo(np.float32).tiny))
-    apply: Callable[[Array], Array]
-    if arrays.compiled:
-        gram[np.diag_indices_from(gram)] += damping
-        apply = partial(cho_solve, cho_factor(gram, lower=True, overwrite_a=True))
-    else:
-        apply = partial(xp.matmul, xp.linalg.inv(gram + damping * arrays.exact().asarray(np.eye(count))))
-
-    def solve(right: Array) -> Array:
-        return xp.reshape(apply(xp.reshape(right.T, (-1,))), shape[::-1]).T
-
-    return solve, damping
 
 
 def _conjugate_gradients(

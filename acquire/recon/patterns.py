@@ -50,6 +50,9 @@ LARGEST_REST = 0.035
 LARGEST_REST_AT_GAP = 0.005
 """The same for patterns that end at a gap; it is smaller, because a bright still can hide what moves before
 it."""
+LEAST_NEED = 0.1
+"""Rise of the prediction error, without the weakest pattern, from which this pattern is needed. Of lamps, it
+rises to three and more times after two rounds; without a superfluous pattern it hardly rises, or falls."""
 FADING = 0.5
 """Power of (largest / own singular value) by which a pattern's λ is larger: weak patterns are smoother."""
 
@@ -119,7 +122,8 @@ class Refinement:
         self._segment, self._problem, self._cosines = segment, problem, cosines
         self._spatial_merge, self._temporal_merge = merge, temporal_merge = merges
         self.parameters, self._first, self._steps = parameters, parameters, 0
-        self._fit = CurveFit(segment, problem, cosines, temporal_merge, RIDGE)
+        self.loosens = True
+        self._fit = CurveFit(segment, problem, cosines, temporal_merge, RIDGE, learns=True)
         n = segment.geometry.size
         fine = found.patterns.repeat(merge, axis=1).repeat(merge, axis=2)[:, :n, :n]
         self.found = Patterns(found.curves, fine)
@@ -154,21 +158,32 @@ class Refinement:
             self._fit_curves()
             self._admm.rebase(*self._operators(), self.found.patterns)
             self.found = Patterns(self.found.curves, self._admm.theta)
-            # lower the weights for the next round
-            now, first = self.parameters, self._first
-            penalty = max(PENALTY_DECAY * now.tv_penalty, LEAST_PENALTY * first.tv_penalty)
-            self.parameters = replace(
-                now,
-                tv_weight=max(WEIGHT_DECAY * now.tv_weight, LEAST_WEIGHT * first.tv_weight),
-                tv_penalty=penalty,
-                sign_penalty=first.sign_penalty * penalty / first.tv_penalty,
-            )
-            self._admm.reweigh(self.parameters)
+            if self.loosens:
+                weight = max(WEIGHT_DECAY * self.parameters.tv_weight, LEAST_WEIGHT * self._first.tv_weight)
+                self._reweigh(weight)
+
+    def hold(self, weight: float) -> None:
+        """Continue with weight λ, at most that of the first round, and no longer lower it."""
+        self.loosens = False
+        self._reweigh(min(weight, self._first.tv_weight))
+
+    def _reweigh(self, weight: float) -> None:
+        """Set λ, and lower the penalties by one step."""
+        now, first = self.parameters, self._first
+        penalty = max(PENALTY_DECAY * now.tv_penalty, LEAST_PENALTY * first.tv_penalty)
+        sign_penalty = first.sign_penalty * penalty / first.tv_penalty
+        self.parameters = replace(now, tv_weight=weight, tv_penalty=penalty, sign_penalty=sign_penalty)
+        self._admm.reweigh(self.parameters)
 
     def return_to(self, found: Patterns) -> None:
         """Make ``found``, the result of an earlier round, the estimate."""
         self.found = found
         self._operators()
+
+    def restarted(self, found: Patterns) -> Refinement:
+        """A new refinement that starts from other patterns, in voxels, of the same scene."""
+        merges = (self._spatial_merge, self._temporal_merge)
+        return Refinement(self._segment, self._problem, self._cosines, found, merges, self._first)
 
     def with_problem(self, problem: Problem, heavier: float = 1.0) -> Refinement:
         """A refinement that continues from here with another problem's samples and a ``heavier`` prior.
@@ -179,11 +194,33 @@ class Refinement:
         other.parameters = replace(self.parameters, tv_weight=heavier * self.parameters.tv_weight)
         other._first = replace(self._first, tv_weight=heavier * self._first.tv_weight)
         other._problem, other._steps = problem, 0
-        other._fit = CurveFit(self._segment, problem, self._cosines, self._temporal_merge, RIDGE)
+        other._fit = CurveFit(self._segment, problem, self._cosines, self._temporal_merge, RIDGE, learns=True)
+        other._fit.prior = self._fit.prior
         operator, basis = other._operators()
         other._admm = self._admm.with_problem(operator, problem.used_samples, heavier)
         other._admm.rebase(operator, basis, self.found.patterns)
         return other
+
+    @property
+    def needed_rank(self) -> int:
+        """Smallest number of the strongest patterns that predict the held-out samples nearly as well as all.
+
+        A pattern of the scene is needed by far, whereas one too many only absorbs errors of the others.
+        """
+        found, flat = self.found, host(self.found.patterns).reshape(self.rank, -1).astype(np.float64)
+        most = (1 + LEAST_NEED) * self._problem.prediction_error(self.predict())
+        _, turn = np.linalg.eigh(flat @ flat.T)
+        turn = turn[:, ::-1].astype(found.curves.dtype)
+        needed = self.rank
+        while needed > 1:
+            kept = turn[:, : needed - 1]
+            patterns = self._problem.arrays.asarray((kept.T @ flat).reshape(-1, *found.patterns.shape[1:]))
+            self.return_to(Patterns(found.curves @ kept, patterns))
+            if not self._problem.prediction_error(self.predict()) < most:
+                break
+            needed -= 1
+        self.return_to(found)
+        return needed
 
     def predict(self) -> NDArray[Any]:
         """The lines of the estimate, as `Problem.samples`."""

@@ -20,7 +20,7 @@ from acquire.recon.bandwidth import FEWEST_COEFFICIENTS, estimate_coefficients
 from acquire.recon.basis import TemporalBasis
 from acquire.recon.curves import CurveFit, CurveOperator
 from acquire.recon.lamps import _whitened, last_lamp
-from acquire.recon.patterns import find_patterns
+from acquire.recon.patterns import Patterns, Refinement, find_patterns
 from acquire.recon.problem import build_problem
 
 GEOMETRY = Geometry(12, 3, 72)
@@ -85,6 +85,47 @@ def test_curves_of_known_patterns_are_exact_even_if_samples_are_lost() -> None:
     np.testing.assert_allclose(seen, cosines.synthesize(wanted)[GEOMETRY.trusted], atol=0.02 / problem.scale)
 
 
+def test_a_learnt_prior_keeps_noise_out_of_the_curves_and_leaves_exact_lines_alone() -> None:
+    """40 cosines, of which two lamps need a few: the others hold noise only, which the prior removes."""
+    cosines, rng = TemporalBasis(GEOMETRY.span, 40), np.random.default_rng(5)
+    wanted = cosines.analyze(LIGHT.T)
+    exact = segment(np.tensordot(cosines.synthesize(wanted), IMAGES, 1))
+
+    def error(recorded: Segment, *, learns: bool) -> float:
+        problem = build_problem(recorded, 1, 1, hold_out=0.0)
+        fit = CurveFit(recorded, problem, cosines, 1, learns=learns)
+        curves = 0.5 * wanted / problem.scale
+        for _ in range(12):
+            curves = fit(IMAGES, curves)
+        shown = cosines.synthesize((curves * problem.scale - wanted).astype(np.float32))
+        return float(np.sqrt(np.square(shown[GEOMETRY.trusted]).mean()))
+
+    noise = 0.02 * exact.lines.max() * rng.standard_normal(exact.lines.shape).astype(np.float32)
+    noisy = replace(exact, lines=exact.lines + noise)
+    assert error(noisy, learns=True) < 0.7 * error(noisy, learns=False)
+    assert error(exact, learns=True) < 2e-3
+
+
+def test_a_pattern_too_many_is_recognised_and_one_of_the_scene_is_not() -> None:
+    problem, cosines = build_problem(segment(), 3, 1, hold_out=0.08), TemporalBasis(GEOMETRY.span, 40)
+    curves, size = np.linalg.qr(cosines.analyze(LIGHT.T))
+    voxels = IMAGES.reshape(2, 12, 3, 12, 3).mean((2, 4))
+    scene = np.tensordot(size, voxels, 1).astype(np.float32) / problem.scale
+    rng = np.random.default_rng(6)
+    other = np.linalg.qr(np.column_stack([curves, rng.standard_normal(40)]))[0]
+    faint = 0.03 * np.abs(scene).max() * rng.random((1, 12, 12))
+    for found, needed in (
+        (Patterns(curves.astype(np.float32), scene), 2),
+        (Patterns(other.astype(np.float32), np.concatenate([scene, faint]).astype(np.float32)), 2),
+    ):
+        refinement = Refinement(segment(), problem, cosines, found, (3, 1))
+        for _ in range(10):
+            refinement.step()
+        before = refinement.predict()
+        assert refinement.needed_rank == needed
+        np.testing.assert_array_equal(refinement.predict(), before)
+
+
 def test_a_scene_of_two_patterns_is_recognised_and_amplitudes_are_kept() -> None:
     result = reconstruct(segment(), 3, 1, "best", iterations=120)
     assert 2 <= result.parameters["patterns"] <= 8
@@ -147,17 +188,26 @@ def test_the_bandwidth_is_found_from_the_lines() -> None:
 
 
 @pytest.mark.parametrize("coarse", [3, 36])
-def test_lamps_are_searched_for_if_coarse_voxels_are_larger_than_the_videos(
-    monkeypatch: pytest.MonkeyPatch, coarse: int
-) -> None:
+def test_lamps_are_searched_for_in_a_fast_scene(monkeypatch: pytest.MonkeyPatch, coarse: int) -> None:
     fast = segment(TRUTH * (0.5 + 0.5 * np.sin(2 * np.pi * INSTANTS / 9))[:, None, None])
     problem, needed = build_problem(fast, 3, 1, hold_out=0.0), 2 * GEOMETRY.span / 9
     asked: list[float] = []
     monkeypatch.setattr("acquire.recon.bandwidth.COARSE_SIDE", coarse)
     found = estimate_coefficients(fast, problem, (3, 1), affords=lambda s: not asked.append(s))
-    assert (found > needed, bool(asked)) == (True, coarse == 3)
+    assert (found > needed, bool(asked)) == (True, True)
     asked.clear()
     estimate_coefficients(fast, problem, (3, 1), affords=lambda s: bool(asked.append(s)))
+
+
+@pytest.mark.parametrize("coarse", [3, 36])
+def test_a_slow_scene_in_fine_coarse_voxels_is_not_searched_for_lamps(
+    monkeypatch: pytest.MonkeyPatch, coarse: int
+) -> None:
+    slow, asked = segment(np.tile(IMAGES.sum(0), (GEOMETRY.span, 1, 1))), []
+    monkeypatch.setattr("acquire.recon.bandwidth.COARSE_SIDE", coarse)
+    problem = build_problem(slow, 3, 1, hold_out=0.0)
+    estimate_coefficients(slow, problem, (3, 1), affords=lambda s: bool(asked.append(s)))
+    assert bool(asked) == (coarse == 3)
 
 
 def lamp(recorded: Segment) -> int:
