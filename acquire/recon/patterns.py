@@ -51,8 +51,8 @@ LARGEST_REST_AT_GAP = 0.005
 """The same for patterns that end at a gap; it is smaller, because a bright still can hide what moves before
 it."""
 LEAST_NEED = 0.1
-"""Rise of the prediction error, without the weakest pattern, from which this pattern is needed. Of lamps, it
-rises to three and more times after two rounds; without a superfluous pattern it hardly rises, or falls."""
+"""Rise of the prediction error, without the weakest pattern, from which this pattern is needed. After two
+rounds it rises to five times without a lamp; without a superfluous pattern it hardly rises, or falls."""
 FADING = 0.5
 """Power of (largest / own singular value) by which a pattern's λ is larger: weak patterns are smoother."""
 
@@ -208,7 +208,7 @@ class Refinement:
         A pattern of the scene is needed by far, whereas one too many only absorbs errors of the others.
         """
         found, flat = self.found, host(self.found.patterns).reshape(self.rank, -1).astype(np.float64)
-        most = (1 + LEAST_NEED) * self._problem.prediction_error(self.predict())
+        error = self._problem.prediction_error(self.predict())
         _, turn = np.linalg.eigh(flat @ flat.T)
         turn = turn[:, ::-1].astype(found.curves.dtype)
         needed = self.rank
@@ -216,9 +216,10 @@ class Refinement:
             kept = turn[:, : needed - 1]
             patterns = self._problem.arrays.asarray((kept.T @ flat).reshape(-1, *found.patterns.shape[1:]))
             self.return_to(Patterns(found.curves @ kept, patterns))
-            if not self._problem.prediction_error(self.predict()) < most:
+            without = self._problem.prediction_error(self.predict())
+            if not without < (1 + LEAST_NEED) * error:
                 break
-            needed -= 1
+            error, needed = without, needed - 1
         self.return_to(found)
         return needed
 
