@@ -20,7 +20,7 @@ from acquire.recon.band import band_operator
 from acquire.recon.bandwidth import FEWEST_COEFFICIENTS, MARGIN, estimate_coefficients, light_beyond
 from acquire.recon.basis import TemporalBasis, resized
 from acquire.recon.estimates import InBand, Refined
-from acquire.recon.patterns import ROUND, Patterns, Refinement, find_patterns
+from acquire.recon.patterns import ROUND, Refinement, find_patterns
 
 if TYPE_CHECKING:
     from acquire.arrays import Array
@@ -63,6 +63,9 @@ PATIENCE = 6
 """Number of rounds without improvement that end a refinement."""
 TRIAL_ROUNDS = 2
 """Number of rounds after which superfluous patterns are recognised."""
+LONGEST_TRIAL, IN_DOUBT = 2, 0.1
+"""Largest number of times that as many rounds are made without them, and the relative rise of the held-out
+error up to which they are made again."""
 LOOSENED_IN_VAIN = 3
 """Number of rounds without improvement after which λ is no longer lowered: noise is being fitted."""
 TIGHTER = 2.0
@@ -196,9 +199,7 @@ def _in_patterns(
         return None
     basis = TemporalBasis(first.basis.frames, first.basis.count, problem.arrays)
     merges = (options.spatial_merge, options.temporal_merge)
-    refinement = _with_needed_patterns(
-        Refinement(segment, problem, basis, found, merges), problem, found, clock
-    )
+    refinement = _with_needed_patterns(Refinement(segment, problem, basis, found, merges), problem, clock)
     best, kept, idle = np.inf, refinement.found, 0
     best_weight, held_best, recent = refinement.parameters.tv_weight, np.inf, np.inf
     for _ in clock.run(clock.iterations - clock.done, "refine", video=refinement.video):
@@ -231,24 +232,31 @@ def _in_patterns(
     return Refined(refinement, basis.count)
 
 
-def _with_needed_patterns(
-    refinement: Refinement, problem: Problem, found: Patterns, clock: IterationClock
-) -> Refinement:
-    """The refinement after a few rounds, or one with fewer patterns if it predicts better after as many.
+def _with_needed_patterns(refinement: Refinement, problem: Problem, clock: IterationClock) -> Refinement:
+    """The refinement after a few rounds, without superfluous patterns.
 
-    The first look tells patterns from its own errors by their energy alone, and may find too many.
+    The first look tells patterns from its own errors by their energy alone, and may find too many. Without
+    the doubtful ones, the held-out samples must be predicted as well after equally many rounds, or nearly as
+    well after a few and as well after more, since the other patterns have to take their light back first.
     """
 
-    def refined(start: Refinement) -> tuple[float, Refinement]:
+    def refine(start: Refinement) -> float:
         for _ in clock.run(TRIAL_ROUNDS * ROUND, "refine", video=start.video):
             start.step()
-        return problem.prediction_error(start.predict()), start
+        return problem.prediction_error(start.predict())
 
-    error, refinement = refined(refinement)
-    if not error < np.inf or (rank := refinement.needed_rank) == refinement.rank:
+    error = refine(refinement)
+    needed = refinement.needed() if error < np.inf else refinement.found
+    if needed.curves.shape[1] == refinement.rank:
         return refinement
-    fewer = Patterns(found.curves[:, :rank], found.patterns[:rank])
-    return min((error, refinement), refined(refinement.restarted(fewer)), key=lambda each: each[0])[1]
+    fewer = refinement.restricted(needed)
+    for _ in range(LONGEST_TRIAL):
+        without, error = refine(fewer), refine(refinement)
+        if without <= error:
+            return fewer
+        if without > (1 + IN_DOUBT) * error:
+            break
+    return refinement
 
 
 def find_band(segment: Segment, problem: Problem, options: SolveOptions, clock: IterationClock) -> int:

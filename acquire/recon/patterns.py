@@ -6,10 +6,10 @@ A first reconstruction in voxels shows how many patterns there are; then pattern
 turn, each against all samples:
 
     Z given u    ADMM in the basis of the curves, with TV and sign       R·n² unknowns
-    u given Z    least squares in the cosines, without a prior           R·K unknowns
+    u given Z    least squares with a prior that the lines choose         R·K unknowns
 
-There are two gains. The curves are not biased by a prior (total variation takes a quarter of a 5 kHz
-amplitude), and edges keep their position. A voxel of N_m > 1 that holds an edge cannot explain its lines:
+There are two gains. The curves are hardly biased (total variation takes a quarter of a 5 kHz amplitude),
+and edges keep their position. A voxel of N_m > 1 that holds an edge cannot explain its lines:
 this model error is some percent, ten to fifty times the noise, and fitting it spoils the picture
 (semi-convergence). At N_m = 1 it is gone; voxels are averaged afterwards.
 """
@@ -50,16 +50,17 @@ LARGEST_REST = 0.035
 LARGEST_REST_AT_GAP = 0.005
 """The same for patterns that end at a gap; it is smaller, because a bright still can hide what moves before
 it."""
-LEAST_NEED = 0.1
-"""Rise of the prediction error, without the weakest pattern, from which this pattern is needed. After two
-rounds it rises to five times without a lamp; without a superfluous pattern it hardly rises, or falls."""
+LEAST_NEED = 0.5
+"""Rise of the prediction error, without the weakest pattern, from which this pattern is surely needed. After
+two rounds it rises to 3.5 times or more without a lamp, also with noise; without a superfluous pattern it
+rises by a third at most, or falls."""
 FADING = 0.5
 """Power of (largest / own singular value) by which a pattern's λ is larger: weak patterns are smoother."""
 
 PARAMETERS = AdmmParameters(tv_penalty=2e-3, sign_penalty=6e-4, grid_per_coefficient=1)
 ROUND = 5
 """Number of ADMM iterations between two fits of the curves."""
-RIDGE = 1e-2
+RIDGE = 3e-3
 """Levenberg's damping of the curves' fit: it slows the curves down, so that the patterns can follow, and does
 not change the fixed point. With a tenth of it the two chase each other and diverge from the truth."""
 PENALTY_DECAY, LEAST_PENALTY = 0.8, 1 / 4
@@ -126,16 +127,21 @@ class Refinement:
         self._fit = CurveFit(segment, problem, cosines, temporal_merge, RIDGE, learns=True)
         n = segment.geometry.size
         fine = found.patterns.repeat(merge, axis=1).repeat(merge, axis=2)[:, :n, :n]
-        self.found = Patterns(found.curves, fine)
+        self._start(Patterns(found.curves, fine))
+
+    def _start(self, found: Patterns) -> None:
+        """Begin ADMM, with the parameters of now, at patterns in pixels."""
+        self.found = found
         operator, basis = self._operators()
+        fine = host(found.patterns)
         size = np.sqrt(np.square(fine, dtype=np.float64).sum((1, 2)))
         emphasis = (size.max() / np.maximum(size, 1e-6 * size.max() + 1e-30)) ** FADING
         self._admm = Admm(
             operator,
-            problem.used_samples,
-            (self.rank, n, n),
+            self._problem.used_samples,
+            fine.shape,
             basis,
-            parameters,
+            self.parameters,
             start=fine,
             emphasis=emphasis,
         )
@@ -180,10 +186,15 @@ class Refinement:
         self.found = found
         self._operators()
 
-    def restarted(self, found: Patterns) -> Refinement:
-        """A new refinement that starts from other patterns, in voxels, of the same scene."""
-        merges = (self._spatial_merge, self._temporal_merge)
-        return Refinement(self._segment, self._problem, self._cosines, found, merges, self._first)
+    def restricted(self, found: Patterns) -> Refinement:
+        """A refinement that continues from here with fewer patterns, in pixels; this one stays as it is."""
+        other = copy(self)
+        other._start(found)
+        other._fit = CurveFit(
+            self._segment, self._problem, self._cosines, self._temporal_merge, RIDGE, learns=True
+        )
+        other._fit.prior = self._fit.prior
+        return other
 
     def with_problem(self, problem: Problem, heavier: float = 1.0) -> Refinement:
         """A refinement that continues from here with another problem's samples and a ``heavier`` prior.
@@ -201,27 +212,29 @@ class Refinement:
         other._admm.rebase(operator, basis, self.found.patterns)
         return other
 
-    @property
-    def needed_rank(self) -> int:
-        """Smallest number of the strongest patterns that predict the held-out samples nearly as well as all.
+    def needed(self) -> Patterns:
+        """The strongest patterns of now, in pixels, without those that the held-out samples may not need.
 
         A pattern of the scene is needed by far, whereas one too many only absorbs errors of the others.
         """
         found, flat = self.found, host(self.found.patterns).reshape(self.rank, -1).astype(np.float64)
-        error = self._problem.prediction_error(self.predict())
         _, turn = np.linalg.eigh(flat @ flat.T)
         turn = turn[:, ::-1].astype(found.curves.dtype)
-        needed = self.rank
+
+        def strongest(count: int) -> Patterns:
+            kept = turn[:, :count]
+            patterns = (kept.T @ flat).reshape(-1, *found.patterns.shape[1:])
+            return Patterns(found.curves @ kept, self._problem.arrays.asarray(patterns.astype(kept.dtype)))
+
+        error, needed = self._problem.prediction_error(self.predict()), self.rank
         while needed > 1:
-            kept = turn[:, : needed - 1]
-            patterns = self._problem.arrays.asarray((kept.T @ flat).reshape(-1, *found.patterns.shape[1:]))
-            self.return_to(Patterns(found.curves @ kept, patterns))
+            self.return_to(strongest(needed - 1))
             without = self._problem.prediction_error(self.predict())
             if not without < (1 + LEAST_NEED) * error:
                 break
             error, needed = without, needed - 1
         self.return_to(found)
-        return needed
+        return found if needed == self.rank else strongest(needed)
 
     def predict(self) -> NDArray[Any]:
         """The lines of the estimate, as `Problem.samples`."""

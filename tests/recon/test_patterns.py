@@ -122,8 +122,13 @@ def test_a_pattern_too_many_is_recognised_and_one_of_the_scene_is_not() -> None:
         for _ in range(10):
             refinement.step()
         before = refinement.predict()
-        assert refinement.needed_rank == needed
+        fewer = refinement.needed()
+        assert fewer.curves.shape[1] == needed
+        other = refinement.restricted(fewer)
+        for _ in range(10):
+            other.step()
         np.testing.assert_array_equal(refinement.predict(), before)
+        assert problem.prediction_error(other.predict()) < problem.prediction_error(before)
 
 
 def test_a_scene_of_two_patterns_is_recognised_and_amplitudes_are_kept() -> None:
