@@ -16,7 +16,7 @@ def test_every_line_has_a_fate_and_nothing_grows(tmp_path: Path) -> None:
     (handles, threads), *_, (handles_end, threads_end) = found.usage
     assert (handles_end, threads_end) == (handles, threads)
     assert set(found.memory) == {"owner", "recorder", *ARMS}
-    assert "too short to tell" in str(found)
+    assert "too short to judge" in str(found)
     assert not any(tmp_path.iterdir())
 
 
