@@ -112,7 +112,7 @@ class AravisNode:
 
     @property
     def selected(self) -> bool:
-        # Aravis does not tell. True means that the value is read back only when it is written.
+        # Aravis does not report it. True means that the value is read back only when it is written.
         return True
 
     def read(self) -> Value:
