@@ -94,22 +94,19 @@ def _tag_rows() -> Iterator[str]:
 
 
 def _rows(register: Register) -> Iterator[str]:
+    # A constant has a reset value here only if it is the same in all devices.
+    known = register.access != "constant" or register.reset
+    reset = f"{register.reset:#x}" if known else "by device"
+    if register is registers.MAP:
+        reset = f"{registers.MAP_CRC:#x}"
     yield (
         f"| 0x{register.address:04x} | {register.name} | {register.width} | {register.access} "
-        f"| {_reset(register)} | {register.doc} |"
+        f"| {reset} | {register.doc} |"
     )
     for field in register.fields:
         top = field.low + field.width - 1
         bits = str(field.low) if field.width == 1 else f"{top}:{field.low}"
         yield f"| | .{field.name} | {bits} | | | {field.doc} |"
-
-
-def _reset(register: Register) -> str:
-    """Return the value at power-up, or the value of a constant if it is the same in all devices."""
-    if register is registers.MAP:
-        return f"{registers.MAP_CRC:#x}"
-    known = register.access != "constant" or register.reset
-    return f"{register.reset:#x}" if known else "by device"
 
 
 def _enum_table(kind: type[IntEnum | IntFlag]) -> str:
