@@ -19,6 +19,7 @@ from acquire.calibrate.choose import carried_calibration
 from acquire.clock import ClockFit
 from acquire.errors import AcquireError, UsageError
 from acquire.lines import ARMS, LineBlock, LineFlag
+from acquire.noise import QUANTISATION_DN2
 from acquire.sim.pipeline import Bench, describe
 from acquire.sim.stopwatch import Stopwatch
 from acquire.store import RecordingSpec, RecordingWriter, RunCondition
@@ -43,8 +44,6 @@ if TYPE_CHECKING:
 
 _BLOCK_LINES = 1024
 _COMMIT_BLOCKS = 32
-_QUANTISATION = 1 / 12
-"""Variance of rounding to whole DN, in DN²."""
 STUDIED_LINES = 512
 BARE = "Eq. (1)"
 LOSS = "dropped_lines"
@@ -158,7 +157,7 @@ def study(bench: Bench, code: Code, lines: int = STUDIED_LINES) -> Study:
     full = _sample(bench, code, lines)
     again = _sample(replace(bench, realisation=bench.realisation + 1), code, lines)
     quiet = _sample(bench.without(*TEMPORAL_NOISE), code, lines)
-    noise_dn = float(np.sqrt(np.mean((full - again) ** 2) / 2 + _QUANTISATION))
+    noise_dn = float(np.sqrt(np.mean((full - again) ** 2) / 2 + QUANTISATION_DN2))
     worths = []
     for effect in kinds:
         if effect in TEMPORAL_NOISE:

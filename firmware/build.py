@@ -22,15 +22,15 @@ from typing import Any
 from amaranth.back import rtlil
 
 from firmware.boards import ulx3s, xc4vsx55
-from firmware.toolchain import LOG, ToolError, run_tool, tell_progress
+from firmware.toolchain import LOG, ToolError, log_progress, run_tool
 from firmware.top import SyncTrigger
 
 SYNTHESIS_S = 1800.0
-"""Of processor time, for each tool; the first run of one compiles it."""
+"""Limit in processor time for each tool, whose first run compiles it."""
 SEED = 1
 COLLISIONS = "setparam -set COLLISION_X_MASK 1'1 t:$memrd_v2 *usb_link*/t:$memrd_v2 %d"
-"""What a block RAM of ours gives while the same word is written is never looked at: no logic is spent on it.
-The queues' never meet (`firmware.formal.tags`); the others are read some clocks after they were written."""
+"""The output of a block RAM while the same word is written is never used, so no logic is spent on it. This
+never happens in the queues (`firmware.formal.tags`); the others are read some clocks after being written."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,9 +39,9 @@ class Fit:
 
     seed: int
     clocks: dict[str, tuple[float, float]]
-    """Net → MHz that it reaches, MHz that it needs."""
+    """Net → MHz reached, MHz required."""
     used: dict[str, tuple[int, int]]
-    """Cell type → used, there are."""
+    """Cell type → number used, number available."""
 
     @property
     def fmax_mhz(self) -> float:
@@ -50,7 +50,7 @@ class Fit:
 
 
 def synthesize(folder: Path, usb: bool = False, light_low: bool = False) -> None:
-    """``trigger.json``: the ULX3S's netlist."""
+    """Write ``trigger.json``, the netlist of the ULX3S."""
     LOG.info("synthesis for %s", ulx3s.DENSITY)
     folder.mkdir(parents=True, exist_ok=True)
     board = _ulx3s(usb, light_low)
@@ -84,7 +84,7 @@ def _ulx3s(usb: bool, light_low: bool) -> ulx3s.Ulx3s:
 
 
 def pack(folder: Path, seed: int) -> Path:
-    """The bitstream of a placement."""
+    """Make the bitstream of a placement; return its path."""
     LOG.info("packing")
     run_tool(
         "yowasp-ecppack",
@@ -105,7 +105,7 @@ def build_ulx3s(
 
 
 def build_xc4vsx55(folder: Path, light_low: bool = False) -> list[Path]:
-    """Verilog, pins and synthesis settings for the vendor's tools."""
+    """Write Verilog, pins and synthesis settings for the vendor's tools; return the paths."""
     folder.mkdir(parents=True, exist_ok=True)
     files = xc4vsx55.files(light_low)
     for name, text in files.items():
@@ -114,7 +114,7 @@ def build_xc4vsx55(folder: Path, light_low: bool = False) -> list[Path]:
 
 
 def area_xc4vsx55(folder: Path) -> dict[str, int]:
-    """Cells of the Virtex-4 by type, as yosys maps them; only the vendor's tools can place them."""
+    """Return the Virtex-4's cells by type, as yosys maps them; only the vendor's tools can place them."""
     folder.mkdir(parents=True, exist_ok=True)
     board = xc4vsx55.Xc4vsx55()
     (folder / "trigger.il").write_text(rtlil.convert(board, ports=board.ports, emit_src=False))
@@ -135,17 +135,17 @@ def _fit(report: dict[str, Any], seed: int) -> Fit:
 def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="python -m firmware.build", description=__doc__.splitlines()[0])
     parser.add_argument("board", choices=("ulx3s", "ulx3s-usb", "xc4vsx55"))
-    parser.add_argument("--out", type=Path, help="folder; build/BOARD")
-    parser.add_argument("--seed", type=int, default=SEED, help="of the placement")
+    parser.add_argument("--out", type=Path, help="folder; absent: build/BOARD")
+    parser.add_argument("--seed", type=int, default=SEED, help="seed of the placement")
     parser.add_argument(
         "--light-active",
         choices=("high", "low"),
         default="high",
-        help="the level that lights the light: the other one is put out from power-up on",
+        help="level that switches the light on; the output has the other level from power-up on",
     )
     chosen = parser.parse_args(arguments)
     folder = chosen.out or Path("build") / chosen.board
-    tell_progress()
+    log_progress()
     try:
         _build(chosen.board, folder, chosen.seed, chosen.light_active == "low")
     except ToolError as error:

@@ -3,8 +3,8 @@ r"""Checks at arming: every error condition is kept in a register, and the first
 ::
 
     configuration  ==X new =====================
-    intermediate   ======X distance of pulses ==      two registers behind the configuration, which holds
-    error          ==========X ErrorCode or 0 ==      still for far longer before an ARM can come
+    intermediate   ======X distance of pulses ==      two registers behind the configuration, which is
+    error          ==========X ErrorCode or 0 ==      constant for far longer before an ARM can come
 """
 
 from amaranth.hdl import Elaboratable, Module, Signal, Value
@@ -35,7 +35,7 @@ class Checks(wiring.Component):
     def elaborate(self, platform: object) -> Elaboratable:
         m = Module()
         m.d.sync += [self.error.eq(0), self.address.eq(0)]
-        # Reversed, since the last assignment counts: of several faults the first of the list is reported.
+        # Reversed, since the last assignment counts: the first of several errors in the list is reported.
         for code, register, condition in reversed(self._conditions(m)):
             failed = Signal(name=f"{code.name}_{register.name}".lower())
             m.d.sync += failed.eq(condition)

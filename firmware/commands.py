@@ -6,7 +6,7 @@ r"""Runs from the host's point of view: ARM, START, STOP by run id, and other en
     IDLE ──────────▶ ARMED ───────────────▶ RUNNING ──────▶ STOPPING ──(line over)──▶ ENDED
     ENDED                └────── STOP ───────────────────────────────────────────────▶
 
-    execute  _/‾\_______      one clock; ``command`` and ``run`` hold still from it to ``done``
+    execute  _/‾\_______      one clock; ``command`` and ``run`` are constant from it to ``done``
     done     _____/‾\___      two clocks later, with ``error`` (0: carried out, or already so)
 
 A command that has been carried out may be repeated: the answer is the same, and nothing changes.
@@ -19,7 +19,8 @@ from amaranth.lib.wiring import In, Out
 from acquire.trigger.registers import CODE_LENGTH, COMMAND, Command, EndReason, ErrorCode, State, TagFlag
 
 SETTLE_CLOCKS = 4
-"""After ARM, before an edge starts: the code memory's first bit takes as long. A START comes later anyway."""
+"""Clocks from ARM until an edge may start the run: the code memory's first bit takes as long. A START comes
+later anyway."""
 
 
 class Commands(wiring.Component):
@@ -29,15 +30,15 @@ class Commands(wiring.Component):
     done: Out(1)
     error: Out(16)
     address: Out(16)
-    """Where the fault is: a register of the configuration, else COMMAND."""
+    """Address of the register at fault: one of the configuration, or COMMAND."""
 
     config_error: In(16)
     config_address: In(16)
     length_good: In(1)
     busy: In(1)
-    """The code memory is being summed up or tested."""
+    """The code memory is being checked or tested, or the last tag of a run waits."""
     edge: In(1)
-    """The external arm's, where enabled."""
+    """Edge of the external arm input, if enabled."""
     watchdog: In(1)
     clock_locked: In(1)
     running: In(1)
@@ -51,7 +52,7 @@ class Commands(wiring.Component):
     self_test: Out(1)
     state: Out(3)
     idle: Out(1)
-    """Nothing armed, nothing runs: configuration may change."""
+    """No run is armed or running: the configuration may change."""
     current: Out(64)
     external: Out(1)
     reason: Out(4)
@@ -129,7 +130,7 @@ class Commands(wiring.Component):
             m.d.sync += self.error.eq(ErrorCode.NOT_ARMED)
         with m.Elif(~same):
             m.d.sync += self.error.eq(ErrorCode.WRONG_RUN)
-        # In any other state it has been carried out before, and changes nothing.
+        # In any other state START has been carried out before, and changes nothing.
         with m.Elif(armed & self.clock_locked):
             m.d.comb += self.start.eq(1)
             m.d.sync += self.state.eq(State.RUNNING)
@@ -177,7 +178,7 @@ class Commands(wiring.Component):
     def _wind_down(self, m: Module, reason: EndReason) -> None:
         m.d.comb += self.stop.eq(1)
         m.d.sync += self.state.eq(State.STOPPING)
-        # The first reason stays: what comes while the last line runs is its consequence, or too late.
+        # The first reason stays: another one during the last line is its consequence, or too late.
         with m.If(self.reason == EndReason.NONE):
             m.d.sync += self.reason.eq(reason)
 

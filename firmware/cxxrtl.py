@@ -49,9 +49,9 @@ _OUTPUT_ROOM = 4096
 _CHANGES_ROOM = 65536
 _LIGHT_ROOM = 4096
 _COMPILE_S = 600.0
-"""Of processor time; some 15 are usual."""
+"""Limit in processor time; about 15 s are usual."""
 _HOST_SIDE = {"build.py", "device.py", "toolchain.py", "twin.py"}
-"""Files that the library is not made of."""
+"""Files that are not part of the library."""
 
 
 class Pin(IntFlag):
@@ -95,7 +95,7 @@ class RunSeen(ctypes.Structure):
     """Observations of the latest run at the pins."""
 
     number: int
-    """From 1; 0 before the first."""
+    """Counts from 1; 0 before the first run."""
     running: int
     pulses_a: int
     pulses_b: int
@@ -107,7 +107,7 @@ class RunSeen(ctypes.Structure):
 
 
 class Twin:
-    """One device in this process. Not for several threads at a time; `close` frees it."""
+    """One device in this process. It is not thread-safe; `close` frees it."""
 
     def __init__(self, build: Build, record: bool = True) -> None:
         self._library = _load(_alike(build))
@@ -209,11 +209,11 @@ def library(build: Build) -> Path:
     if not path.exists():
         path.parent.mkdir(parents=True, exist_ok=True)
         with path.with_suffix(".lock").open("w") as lock:
-            fcntl.flock(lock, fcntl.LOCK_EX)  # of several that need it, one compiles it
+            fcntl.flock(lock, fcntl.LOCK_EX)  # if several processes need it, one compiles it
             if not path.exists():
                 with tempfile.TemporaryDirectory(dir=path.parent) as scratch:
                     _compile(_translate(build, Path(scratch)), Path(scratch) / path.name)
-                    (Path(scratch) / path.name).rename(path)  # who finds it finds all of it
+                    (Path(scratch) / path.name).rename(path)  # never visible half written
     return path
 
 
@@ -255,16 +255,16 @@ def _translate(build: Build, directory: Path) -> Path:
 
     from firmware.top import Build, SyncTrigger
 
-    told = {r.CLOCK_HZ: Signal(32, name="told_clock_hz"), r.SERIAL: Signal(64, name="told_serial")}
+    given = {r.CLOCK_HZ: Signal(32, name="given_clock_hz"), r.SERIAL: Signal(64, name="given_serial")}
 
-    class Told(Build):
+    class Given(Build):  # clock and serial number are inputs of the library
         def constants(self) -> dict[r.Register, Any]:
-            return {**super().constants(), **told}
+            return {**super().constants(), **given}
 
     top = Module()
     top.domains += (domain := ClockDomain("sync", reset_less=True))  # half the work per clock
-    top.submodules.trigger = trigger = SyncTrigger(Told(**vars(build)))
-    ports = [domain.clk, *told.values(), *(getattr(trigger, name) for name in trigger.signature.members)]
+    top.submodules.trigger = trigger = SyncTrigger(Given(**vars(build)))
+    ports = [domain.clk, *given.values(), *(getattr(trigger, name) for name in trigger.signature.members)]
     design = directory / "design.cpp"
     design.write_text(cxxrtl.convert(top, name="top", ports=ports), encoding="utf-8")
     return design

@@ -5,9 +5,9 @@ r"""Bytes of the link → frames: COBS decoded, CRC-32 checked, one frame kept u
     bytes    c0 d d d c1 d d ... 00                  00 ends a frame, whatever came before
     memory      d d d 0  d d ... crc crc crc crc
     frame    __________________________/‾‾‾‾‾‾‾\___   high from the delimiter until `release`
-    ready    ‾‾‾‾‾‾‾‾‾‾‾‾‾‾‾‾‾‾‾‾‾‾‾‾‾‾‾\_______/‾‾‾   bytes wait outside meanwhile, none is lost
+    ready    ‾‾‾‾‾‾‾‾‾‾‾‾‾‾‾‾‾‾‾‾‾‾‾‾‾‾‾\_______/‾‾‾   until then bytes wait outside, none is lost
 
-A frame that is too long, too short, cut or of wrong checksum is dropped and counted (``bad``).
+A frame that is too long, too short or cut, or has a wrong checksum, is dropped and counted (``bad``).
 """
 
 from amaranth.hdl import Elaboratable, Module, Signal
@@ -74,7 +74,7 @@ class Deframer(wiring.Component):
                     broken.eq(0),
                 ]
             with m.Elif(left == 0):
-                # COBS leaves a zero out after each block, but for those that are full: 254 bytes.
+                # COBS omits a zero after each block, except after full blocks of 254 bytes.
                 m.d.comb += [emit.eq(begun & follow_zero), write.data.eq(0)]
                 m.d.sync += [left.eq(byte - 1), begun.eq(1), follow_zero.eq(byte != 0xFF)]
             with m.Else():

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
 _SLICE_CLOCKS = 4000
-"""At most one answer's worth of the link between two looks at it."""
+"""Clocks between two polls of the link: at most those of one answer."""
 _IDLE_CLOCKS = 400
 _WORK_S = 0.01
 
@@ -27,7 +27,7 @@ class RtlDevice:
 
     Parameters
     ----------
-    watch : is shown the twin after every slice of time, and wherever a run begins or ends
+    watch : called with the twin after every slice of time, and wherever a run begins or ends
     """
 
     def __init__(self, build: Build | None = None, watch: Callable[[Twin], None] | None = None) -> None:
@@ -51,9 +51,7 @@ class RtlDevice:
         with self._lock:
             while True:
                 clocks = _SLICE_CLOCKS if self.busy else _IDLE_CLOCKS
-                while (
-                    clocks > 0
-                ):  # it stops where a run begins or ends, so that who watches sees each of them
+                while clocks > 0:  # `advance` stops where a run begins or ends: `watch` is called at each
                     clocks -= self.twin.advance(clocks)
                     if self._watch is not None:
                         self._watch(self.twin)

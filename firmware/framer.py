@@ -4,9 +4,9 @@
 
     valid, ready  bytes of version, type, sequence, payload; `last` marks the final one
     memory        [code] b b b [code] b b ... crc×4 [00]
-    bytes         sent once the frame is whole; no byte is taken meanwhile
+    bytes         sent once the frame is whole; no byte is taken during that time
 
-COBS in one pass: the place of the code byte is left free and filled in at the next zero (or the end), so that
+COBS in one pass: the place of the code byte is reserved and filled in at the next zero (or the end), so that
 every byte takes one write. It requires frames shorter than 254 bytes.
 """
 

@@ -1,4 +1,4 @@
-r"""Carries out the host's requests one after the other, and sends tags in between.
+r"""The host's requests, carried out one after the other, and tags, sent in between.
 
 ::
 
@@ -72,7 +72,7 @@ class Host(wiring.Component):
                 "code_read": Out(1),
                 "code_data": In(32),
                 "code_write": Out(1),
-                # a request of good form has come
+                # a well-formed request has come
                 "heard": Out(1),
             }
         )
@@ -101,7 +101,9 @@ class Host(wiring.Component):
             self.data.eq(self._shift[:8]),
             self.last.eq((self._bytes == 1) & ~self.more),
         ]
-        self._inside = Signal()  # a clock behind the address, which has stood for several when it is asked
+        self._inside = (
+            Signal()
+        )  # a clock behind the address, which has been constant for several clocks when it is used
         m.d.sync += [
             self._step.eq(self._step + 1),
             self._inside.eq(
@@ -152,8 +154,8 @@ class Host(wiring.Component):
         version, kind, asked = self._head[:8], self._head[8:16], self._head[48:56]
         payload = self.length - deframer.HEADER_BYTES
         words = (payload - 2)[2:8]
-        # Registers of several words are caught now, all in one clock: read one after the other they would be
-        # of different moments.
+        # Sample the registers of several words now, all in one clock: read one after the other they would
+        # belong to different moments.
         m.d.comb += self.sample.eq(1)
         m.d.sync += [
             self._address.eq(self._head[32:48]),

@@ -7,8 +7,8 @@ r"""The light: code bit AND window AND scene gate.
     clock    --- 0  1  2  3  4  5  6  0  1  2  3  4  5
     led      ________/‾‾‾‾‾‾‾‾‾\___________/‾‾‾‾‾‾‾‾‾\_      window_open = 2, window_close = 5; b0 = b1 = 1
 
-``led`` comes two clocks after the bit's register: as late behind its sub-step, less the lead, as a camera
-pulse of no delay behind its line.
+``led`` comes two clocks after the bit's register: apart from the lead, it follows its sub-step as late as a
+camera pulse without delay follows its line.
 """
 
 from amaranth.hdl import Elaboratable, Module, Signal
@@ -30,7 +30,7 @@ class Light(wiring.Component):
     scene_gate: In(1)
     """From outside, already in this clock's domain."""
     lit: Out(1)
-    """What the sub-step's code bit says, before the window and the gates."""
+    """The sub-step's code bit, before the window and the gates."""
     led: Out(1)
 
     def elaborate(self, platform: object) -> Elaboratable:

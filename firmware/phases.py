@@ -5,7 +5,7 @@ r"""The clocks of a three-phase TDI sensor: six sub-phases per line move the cha
     line     /‾\______________________________________/‾\       S = 3: two sub-phases in each sub-step
     substep  /‾\__________/‾\__________/‾\____________/‾\
     phase      0   | 1      2   | 3      4   | 5        0       the first lasts ``phase_clocks``, the last
-    P1       ‾‾‾‾‾‾‾‾‾\_____________________/‾‾‾‾‾‾‾‾‾‾‾‾       of a sub-step what is left of it
+    P1       ‾‾‾‾‾‾‾‾‾\_____________________/‾‾‾‾‾‾‾‾‾‾‾‾       of a sub-step takes the rest of it
     P2       ____/‾‾‾‾‾‾‾‾‾‾‾‾\_________________________
     P3       ______________/‾‾‾‾‾‾‾‾‾‾‾‾‾‾‾‾‾‾‾\_______
 
@@ -23,7 +23,7 @@ SUBPHASES = {1: 6, 2: 3, 3: 2, 6: 1}
 
 
 class Phases(wiring.Component):
-    """``phase_clocks`` = 0: the clocks rest low, for cameras that make their own."""
+    """``phase_clocks`` = 0: the clocks rest low, for cameras that generate their own."""
 
     running: In(1)
     substep: In(1)
@@ -42,7 +42,7 @@ class Phases(wiring.Component):
         m.d.comb += on.eq(self.running & (self.phase_clocks != 0))
         m.d.sync += self.phases.eq(Mux(moving, Mux(self.backwards, mirrored[phase], levels[phase]), 0))
         with m.If(~on):
-            m.d.sync += [phase.eq(5), more.eq(0), moving.eq(0)]  # the one before the first of a line
+            m.d.sync += [phase.eq(5), more.eq(0), moving.eq(0)]  # the sub-phase before the first of a line
         with m.Elif(self.substep):
             m.d.sync += [left.eq(self.phase_clocks - 1), more.eq(ahead[self.substeps]), moving.eq(1)]
             self._next(m, phase, self.line)

@@ -8,7 +8,7 @@ r"""One camera's trigger output: a pulse per request, after ``delay`` clocks and
     level   _________________/‾‾‾‾‾‾‾\___
 
 ``level`` rises ``delay + 2`` clocks after ``fire``. The limits that arming checks (delay + width shorter than
-the distance of two pulses) keep a request from meeting an unfinished pulse; if one does, the new pulse wins.
+the period of the pulses) keep a request from meeting an unfinished pulse; if one does, the new pulse wins.
 """
 
 from amaranth.hdl import Elaboratable, Module, Signal
@@ -33,7 +33,7 @@ class Pulse(wiring.Component):
         wait, hold, waiting, active = Signal(WIDTH), Signal(WIDTH), Signal(), Signal()
         m.d.sync += self.level.eq(active ^ self.inverted)
         m.d.comb += self.begin.eq(active & (hold == self.width))
-        # A request first: what an earlier pulse still had to do is given up for it.
+        # A request takes precedence: the rest of an earlier pulse is abandoned.
         with m.If(self.fire & self.enable):
             m.d.sync += [wait.eq(self.delay - 1), waiting.eq(self.delay != 0), active.eq(self.delay == 0)]
             m.d.sync += hold.eq(self.width)

@@ -92,7 +92,7 @@ class RegisterFile(wiring.Component):
         return [padded.word_select(at, 32) for at in range(register.words)]
 
     def _sampled(self, m: Module, register: r.Register) -> Signal:
-        # Its words are read one after the other; all are of the moment of the request.
+        # Its words are read one after the other; all belong to the moment of the request.
         kept = Signal(register.width, name=f"{register.name.lower()}_sampled")
         with m.If(self.sample):
             m.d.sync += kept.eq(self.value(register))

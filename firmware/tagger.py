@@ -69,8 +69,8 @@ class Tagger(wiring.Component):
                 time.eq(self.now),
                 flags.eq(int(TagFlag.LINE) | Mux(begun, 0, first)),
             ]
-        # Not in the clock of a line: both would be put at once. `ready`: the entry before is still in the
-        # registers that this one would take.
+        # Not in the clock of a line, since both would be put at once, and not while the previous entry is
+        # still in the registers (`ready`).
         with m.Elif(pending.any() & ~self.line & ~self.full & ~ready):
             m.d.sync += [ready.eq(1), time.eq(self.now), flags.eq(pending), pending.eq(self.events)]
         with m.If(ready):

@@ -10,8 +10,8 @@ r"""The time base: sub-steps, lines and the instants at which the light advances
     line      ____________/‾‾‾\___________________________________/‾‾‾       first clock of every S-th
 
 Clock 0 of a run is that of its first ``substep``: START_CLOCKS + lead after ``start``.
-Whether a line is the last one is decided at the ``advance`` that leads out of it, so that the light never
-begins a sub-step that does not come. A stop therefore takes effect after a whole line.
+The ``advance`` at the end of a line decides whether it was the last one, so that the light never begins a
+sub-step that does not come. A stop therefore takes effect after a whole line.
 """
 
 from amaranth.hdl import Elaboratable, Module, Signal
@@ -34,7 +34,7 @@ class Timing(wiring.Component):
     lead: In(LEAD_BITS)
     """Below ``substep_clocks``."""
     lines: In(48)
-    """Lines to do; 0: until stopped."""
+    """Number of lines of the run; 0: until stopped."""
     start: In(1)
     stop: In(1)
     """May come at any time and be as short as one clock."""
@@ -70,7 +70,7 @@ class Timing(wiring.Component):
         m.d.sync += [
             self.substep.eq(0),
             self.line.eq(0),
-            # A clock behind the number, which holds still for a line: five clocks at least.
+            # A clock behind the number, which is constant for a line: five clocks at least.
             last_is_next.eq(self.line_number + 2 == self.lines),
         ]
         with m.If(self.stop & self.running):
@@ -93,7 +93,7 @@ class Timing(wiring.Component):
             m.d.sync += [leading.eq(0), self.line_number.eq(0), self.code_index.eq(0), self.place.eq(0)]
             m.d.sync += self.last_line.eq(self.lines == 1)
             self._begin(m, left, line=1)
-        # As the last advance decided, which may be this very clock (lead = 0).
+        # According to the last advance, which may be in this very clock (lead = 0).
         with m.Elif(last_place & (leaving | (self.advance & self.ending))):
             m.d.sync += self.running.eq(0)
         with m.Else():

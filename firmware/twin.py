@@ -35,7 +35,7 @@ class Publisher:
 
     def __init__(self, page: PinPage, clock_hz: int) -> None:
         self._page, self._clock_hz = page, clock_hz
-        self._before = page.latest_run  # of an earlier process: its numbers are not used again
+        self._before = page.latest_run  # of an earlier process, whose numbers are not used again
 
     def __call__(self, twin: Twin) -> None:
         run, light = twin.latest_run, twin.take_light()
@@ -51,8 +51,10 @@ class Publisher:
 
 def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="python -m firmware.twin", description=__doc__.splitlines()[0])
-    parser.add_argument("--clock-hz", type=int, default=Build.clock_hz, help="what the device says it has")
-    parser.add_argument("--clocks-per-bit", type=int, default=8, help="of the UART, 8 or more")
+    parser.add_argument(
+        "--clock-hz", type=int, default=Build.clock_hz, help="clock frequency that the device reports"
+    )
+    parser.add_argument("--clocks-per-bit", type=int, default=8, help="clocks per bit of the UART, 8 or more")
     parser.add_argument("--pins", type=int, metavar="FD", help="inherited page to publish the pins on")
     parser.add_argument("--compile", action="store_true", help="compile the gateware and end")
     parser.add_argument("--owned", action="store_true", help="end when standard input is closed")
@@ -87,7 +89,7 @@ def _run(chosen: argparse.Namespace, end: threading.Event) -> None:
 
 
 def _await_owner(end: threading.Event) -> None:
-    while os.read(0, 1024):  # not by way of sys.stdin, which the interpreter's end would wait for
+    while os.read(0, 1024):  # not through sys.stdin, for which the interpreter would wait when it exits
         pass
     end.set()
 

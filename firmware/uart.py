@@ -3,8 +3,8 @@ r"""UART, 8 data bits, no parity, one stop bit; every bit lasts ``divisor`` cloc
 ::
 
     line  ‾‾‾\____X=d0=X=d1=X ... X=d7=X‾stop‾‾‾‾      one bit = divisor clocks
-    the receiver samples each bit in its middle; a byte whose stop bit is low is dropped: the
-    CRC of its frame tells.
+    the receiver samples each bit in its middle; a byte whose stop bit is low is dropped, which the
+    CRC of its frame reveals.
 """
 
 from amaranth.hdl import Cat, Const, Elaboratable, Module, Signal

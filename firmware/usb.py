@@ -24,14 +24,14 @@ from firmware.fifo import Queue
 from firmware.framer import Framer
 from firmware.top import Build, SyncTrigger
 
-with warnings.catch_warnings():  # LUNA 0.2 still uses what Amaranth 0.6 will no longer have
+with warnings.catch_warnings():  # LUNA 0.2 still uses features that Amaranth 0.6 removes
     warnings.simplefilter("ignore", DeprecationWarning)
     from luna.gateware.usb.usb2.device import USBDevice
     from luna.gateware.usb.usb2.endpoints.stream import USBStreamInEndpoint, USBStreamOutEndpoint
 
 ENDPOINT = 1
 PACKET_BYTES = 64
-"""The most at full speed."""
+"""Largest packet at full speed."""
 CROSSING_BYTES = 16
 VENDOR_SPECIFIC = 0xFF
 _TO_HOST = 0x80

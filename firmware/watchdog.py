@@ -1,4 +1,4 @@
-r"""Ends a run whose host has fallen silent: it watches from the run's first clock, however that was started.
+r"""The watchdog: it ends a run whose host has fallen silent, from the run's first clock on.
 
 ::
 
@@ -16,7 +16,7 @@ from amaranth.lib import wiring
 from amaranth.lib.wiring import In, Out
 
 BARK_CLOCKS = 2
-"""From the last of ``period`` silent clocks to ``bark``."""
+"""Clocks from the last of ``period`` silent clocks to ``bark``."""
 
 
 class Watchdog(wiring.Component):

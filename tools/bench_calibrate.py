@@ -258,7 +258,7 @@ def _psnr(segment: Segment, truth: NDArray[np.float32]) -> float:
 
 def orientations(seed: int, lines: int, run: Run) -> None:
     """24 instruments: eight views of arm B, three targets each."""
-    right = wrong = untold = 0
+    right = wrong = undetermined = 0
     for number, view in enumerate(VIEWS * 3):
         drawn = Drawn.at_random(seed + number)
         optics = {"b": {"turn_deg": view.turn_deg, "mirror": view.mirrored}}
@@ -276,11 +276,11 @@ def orientations(seed: int, lines: int, run: Run) -> None:
             recording = open_recording(path)
             found = orientation(open_exposure(path), Calibration(instrument_of(recording)))
         right += found.orientation == view.name
-        untold += found.orientation is None
+        undetermined += found.orientation is None
         wrong += found.orientation not in (None, view.name)
         print(f"{view.name:20} found {found.orientation!s:20} ratio {found.facts['ratio']:.2f}", flush=True)
-    print(f"{right} right, {untold} not told, {wrong} wrong")
-    run.add("orientations", right=right, not_told=untold, wrong=wrong)
+    print(f"{right} right, {undetermined} undetermined, {wrong} wrong")
+    run.add("orientations", right=right, undetermined=undetermined, wrong=wrong)
 
 
 def main() -> None:
@@ -294,38 +294,38 @@ def main() -> None:
     parser.add_argument("--orientations", action="store_true")
     parser.add_argument("--json", type=Path)
     add_option(parser)
-    asked = parser.parse_args()
-    with recorded("bench_calibrate", keep=asked.record) as run:
-        if asked.orientations:
-            orientations(asked.seed, asked.lines, run)
+    options = parser.parse_args()
+    with recorded("bench_calibrate", keep=options.record) as run:
+        if options.orientations:
+            orientations(options.seed, options.lines, run)
         else:
-            instruments(asked, run)
+            instruments(options, run)
 
 
-def instruments(asked: argparse.Namespace, run: Run) -> None:
+def instruments(options: argparse.Namespace, run: Run) -> None:
     """Calibrate random instruments, and print the worst value of each figure."""
     rows = []
-    for number in range(asked.instruments):
-        drawn = Drawn.at_random(asked.seed + number)
+    for number in range(options.instruments):
+        drawn = Drawn.at_random(options.seed + number)
         with tempfile.TemporaryDirectory() as name:
             began = time.perf_counter()
-            known = calibrate(drawn, Path(name), asked.lines)
+            known = calibrate(drawn, Path(name), options.lines)
             row = {"calibration_s": time.perf_counter() - began, **compared(drawn, known, Path(name))}
-            if not asked.no_video:
+            if not options.no_video:
                 row |= pictures(drawn, known, Path(name))
         rows.append({"instrument": asdict(drawn), **row})
         where = f"{drawn.rows:+.2f}/{drawn.columns:+.2f} px {drawn.turn_deg:+.2f} deg {drawn.beyond}"
         where += f" psf {drawn.blur:.2f}"
         print(
-            f"{asked.seed + number:3} {where:44} " + "  ".join(f"{k} {v:.4g}" for k, v in row.items()),
+            f"{options.seed + number:3} {where:44} " + "  ".join(f"{k} {v:.4g}" for k, v in row.items()),
             flush=True,
         )
-        run.add(f"seed {asked.seed + number}", **row)
+        run.add(f"seed {options.seed + number}", **row)
     worst = {key: max(row[key] for row in rows) for key in rows[0] if key != "instrument"}
     print("worst " + "  ".join(f"{key} {value:.4g}" for key, value in worst.items()))
     run.add("the largest of each", **worst)
-    if asked.json is not None:
-        asked.json.write_text(json.dumps(rows, indent=1) + "\n", encoding="utf-8")
+    if options.json is not None:
+        options.json.write_text(json.dumps(rows, indent=1) + "\n", encoding="utf-8")
 
 
 if __name__ == "__main__":

@@ -117,29 +117,29 @@ def main() -> None:
     parser.add_argument("--budget", type=float, default=15.0, metavar="SECONDS")
     parser.add_argument("--seed", type=int, default=1, help="of the exposure code")
     parser.add_argument("--pictures", type=Path, metavar="DIRECTORY")
-    asked = parser.parse_args()
-    if asked.pictures:
-        asked.pictures.mkdir(parents=True, exist_ok=True)
+    options = parser.parse_args()
+    if options.pictures:
+        options.pictures.mkdir(parents=True, exist_ok=True)
     print(
         f"{'clip':20}{'ours dB':>9}{'SSIM':>7}{'s':>6}{'TwIST dB':>10}{'SSIM':>7}{'s':>6}{'difference':>12}"
     )
     with tempfile.TemporaryDirectory() as directory:
-        for number, clip in enumerate(asked.clips):
-            case = record(clip, asked.seed, Path(directory))
+        for number, clip in enumerate(options.clips):
+            case = record(clip, options.seed, Path(directory))
             if number == 0:  # compiles
                 for solver in SOLVERS:
                     reconstruct(case.segment, *VOXELS, solver=solver, iterations=2)
-            results = {solver: solve(case, solver, asked.budget) for solver in SOLVERS}
+            results = {solver: solve(case, solver, options.budget) for solver in SOLVERS}
             decibels, row = [], f"{case.name:20}"
             for (result, video), width in zip(results.values(), (9, 10), strict=True):
                 decibels.append(psnr(video, case.truth))
                 row += f"{decibels[-1]:{width}.1f}{ssim(video, case.truth):7.3f}{result.seconds:6.1f}"
             print(f"{row}{decibels[0] - decibels[1]:9.1f} dB", flush=True)
-            if asked.pictures:
+            if options.pictures:
                 draw(
                     case,
                     {name: video for name, (_, video) in results.items()},
-                    asked.pictures / f"{case.name}.png",
+                    options.pictures / f"{case.name}.png",
                 )
 
 

@@ -52,12 +52,12 @@ def main() -> None:
     parser.add_argument("--threads", nargs="+", type=int, default=[usable_cores()])
     parser.add_argument("--solvers", nargs="+", default=list(ITERATIONS), choices=list(ITERATIONS))
     add_option(parser)
-    asked = parser.parse_args()
-    with recorded("bench_devices", keep=asked.record) as run:
-        table(asked, run)
+    options = parser.parse_args()
+    with recorded("bench_devices", keep=options.record) as run:
+        table(options, run)
 
 
-def table(asked: argparse.Namespace, run: Run) -> None:
+def table(options: argparse.Namespace, run: Run) -> None:
     """Print a line per solver, device, dtype and number of threads."""
     case = CASES["fig9"]
     scene, segment = record(case, 1)
@@ -65,8 +65,8 @@ def table(asked: argparse.Namespace, run: Run) -> None:
     print(f"{usable_cores()} cores may be used, {idle_cores()} idle now")
     print(f"{'solver':11}{'device':>7}{'dtype':>9}{'threads':>8}{'wall s':>8}{'CPU s':>7}", end="")
     print(f"{'wall ×':>8}{'CPU ×':>7}{'PSNR dB':>10}")
-    for solver in asked.solvers:
-        cases = list(itertools.product(asked.devices, asked.dtypes, asked.threads))
+    for solver in options.solvers:
+        cases = list(itertools.product(options.devices, options.dtypes, options.threads))
         runs: dict[tuple[str, str, int], list[tuple[float, float, Any]]] = {each: [] for each in cases}
         measure(segment, solver, *cases[0])  # compiles
         for _, each in itertools.product(range(ROUNDS), cases):

@@ -146,10 +146,10 @@ def main() -> None:
     parser.add_argument("--scenes", nargs="+", choices=list(SCENES), default=list(SCENES))
     parser.add_argument("--full-well", type=float, default=1e4, help="electrons of the brightest sample")
     add_option(parser)
-    asked = parser.parse_args()
-    camera = Camera(full_well_e=asked.full_well)
-    with limit_threads(1), recorded("bench_diagnose", keep=asked.record) as run:
-        table(asked.scenes, asked.seeds, camera, lambda line: print(line, flush=True), run)
+    options = parser.parse_args()
+    camera = Camera(full_well_e=options.full_well)
+    with limit_threads(1), recorded("bench_diagnose", keep=options.record) as run:
+        table(options.scenes, options.seeds, camera, lambda line: print(line, flush=True), run)
 
 
 if __name__ == "__main__":

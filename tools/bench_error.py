@@ -42,8 +42,8 @@ Make = Callable[..., Recorded]
 RIDGE = 0.02
 """Share of the number of cases: the penalty that pulls unimportant exponents towards 0."""
 FAR, ROUNDS = 0.3, 30
-"""Of a logarithm, beyond which a case counts for less (Huber), and fits until that has settled: a flash
-before a clean still is off by five times, and would bend all others."""
+"""Logarithm of an error beyond which a case counts for less (Huber), and number of fits until the weights
+have settled. A flash before a clean still is off by five times and would distort all others."""
 CUT = ("leds", "leds_dot", "digits", "flicker")
 CUT_CAMERAS, CUTS = ("1e4", "clean"), (60, 140, 300)
 """Scenes, the slowest to converge, that the fit also interrupts after these iterations, in 3 × 1 voxels."""
@@ -98,11 +98,11 @@ def measure(
 
 
 def show(case: Case, run: Run) -> tuple[bool, np.ndarray, np.ndarray] | None:
-    """Print a row; return whether the interval of the whole held, and of which regions and frames."""
+    """Print a row; return whether the interval of the whole held, and those of each region and frame."""
     error = case.error
     if isinstance(error, str):
-        print(f"{case.name:30} cannot be told: {error}", flush=True)
-        run.add(case.name, true_rms=case.rms, told=error)
+        print(f"{case.name:30} unknown: {error}", flush=True)
+        run.add(case.name, true_rms=case.rms, reason=error)
         return None
     regions = np.sqrt(np.square(error.regions[case.shown]).mean(0)).ravel()
     frames = error.frames[case.shown]
@@ -197,28 +197,31 @@ def _shares(scenes: list[str]) -> np.ndarray:
 
 def fit(cases: list[Case]) -> Exponents:
     """Fit the exponents in use; keep the factors, which come from scenes left out of the fit."""
-    told = [(case, case.error.indicators) for case in cases if isinstance(case.error, VideoError)]
-    scenes = [case.scene for case, _ in told]
-    known = told[0][1].exponents
+    estimated = [(case, case.error.indicators) for case in cases if isinstance(case.error, VideoError)]
+    scenes = [case.scene for case, _ in estimated]
+    known = estimated[0][1].exponents
     there = known.whole != 0
     whole = np.zeros(len(there))
     whole[there] = robust(
-        [signs(indicators, case.shown)[None, there] for case, indicators in told],
-        [np.log([case.rms / indicators.residual]) for case, indicators in told],
+        [signs(indicators, case.shown)[None, there] for case, indicators in estimated],
+        [np.log([case.rms / indicators.residual]) for case, indicators in estimated],
         scenes,
     )
     true = [
-        np.maximum(case.regions, indicators.exponents.floor * indicators.scale) for case, indicators in told
+        np.maximum(case.regions, indicators.exponents.floor * indicators.scale)
+        for case, indicators in estimated
     ]
     here = robust(
-        [signs_here(indicators, case.shown) for case, indicators in told],
+        [signs_here(indicators, case.shown) for case, indicators in estimated],
         [np.log(each / np.sqrt(np.square(each).mean())) for each in true],
         scenes,
     )
-    moved = [np.sqrt(np.square(indicators.sensitivity[case.shown]).mean((1, 2))) for case, indicators in told]
+    moved = [
+        np.sqrt(np.square(indicators.sensitivity[case.shown]).mean((1, 2))) for case, indicators in estimated
+    ]
     now = robust(
         [np.log(each / np.sqrt(np.square(each).mean()))[:, None] for each in moved],
-        [np.log(case.frames / case.rms) for case, _ in told],
+        [np.log(case.frames / case.rms) for case, _ in estimated],
         scenes,
     )
     names = [each.name for each in fields(Exponents) if each.type == "float" and each.name != "floor"]
@@ -238,18 +241,20 @@ def nine_of_ten(off: list[np.ndarray], scenes: list[str]) -> tuple[float, float]
 
 def calibrate(cases: list[Case], name: str, known: Exponents) -> None:
     """Print the exponents, and the factors between true error and estimate on scenes left out of the fit."""
-    told = [
+    estimated = [
         case
         for case in cases
         if isinstance(case.error, VideoError)
         and case.error.indicators.exponents is known
         and case.scene != BEYOND_THE_BAND
     ]
-    print(f"{name}: {len(told)} cases")
-    scenes = [case.scene for case in told]
-    others = {scene: fit([case for case in told if case.scene != scene]) for scene in sorted(set(scenes))}
+    print(f"{name}: {len(estimated)} cases")
+    scenes = [case.scene for case in estimated]
+    others = {
+        scene: fit([case for case in estimated if case.scene != scene]) for scene in sorted(set(scenes))
+    }
     wholes, here, now, alike = [], [], [], []
-    for case in told:
+    for case in estimated:
         assert isinstance(case.error, VideoError)
         found = error_from(case.error.indicators, case.shown, others[case.scene])
         regions = np.sqrt(np.square(found.regions[case.shown]).mean(0)).ravel()
@@ -265,7 +270,7 @@ def calibrate(cases: list[Case], name: str, known: Exponents) -> None:
         f" a tenth below {np.nanquantile(alike, 0.1):.2f}"
     )
     factors = [nine_of_ten(off, scenes) for off in (wholes, here, now)]
-    powers = fit(told)
+    powers = fit(estimated)
     print(
         f"{name} =", replace(powers, factors=factors[0], region_factors=factors[1], frame_factors=factors[2])
     )
@@ -288,23 +293,23 @@ def main() -> None:
     parser.add_argument("--seeds", nargs="+", type=int, metavar="SEED")
     parser.add_argument("--cameras", nargs="+", default=list(CAMERAS), choices=list(CAMERAS))
     add_option(parser)
-    asked = parser.parse_args()
+    options = parser.parse_args()
     drawn: list[tuple[str, Make, Sequence[int]]]
-    if asked.fit:
-        drawn = [(name, procedural.record, asked.seeds or (311, 312)) for name in procedural.SCENES]
-        drawn += [(name, error_scenes.record, asked.seeds or (41,)) for name in error_scenes.SCENES]
+    if options.fit:
+        drawn = [(name, procedural.record, options.seeds or (311, 312)) for name in procedural.SCENES]
+        drawn += [(name, error_scenes.record, options.seeds or (41,)) for name in error_scenes.SCENES]
     else:
-        names = asked.scenes or error_scenes.KEPT
-        drawn = [(name, error_scenes.record, asked.seeds or (901,)) for name in names]
-    with limit_threads(1), recorded("bench_error", keep=asked.record and not asked.fit) as run:
+        names = options.scenes or error_scenes.KEPT
+        drawn = [(name, error_scenes.record, options.seeds or (901,)) for name in names]
+    with limit_threads(1), recorded("bench_error", keep=options.record and not options.fit) as run:
         cases = (
             measure(name, seed, camera, voxels, make, iterations)
             for name, make, seeds in drawn
             for seed in seeds
-            for camera in asked.cameras
-            for voxels, iterations in ways(name, camera, cut=asked.fit)
+            for camera in options.cameras
+            for voxels, iterations in ways(name, camera, cut=options.fit)
         )
-        if asked.fit:
+        if options.fit:
             measured = list(cases)
             for name in ("BY_LINES", "BY_PRIOR"):
                 calibrate(measured, name, getattr(estimation, name))

@@ -69,20 +69,20 @@ def main() -> None:
     )
     parser.add_argument("--workers", type=int)
     parser.add_argument("--keep", type=Path, help="directory in which recording and video are kept")
-    asked = parser.parse_args()
+    options = parser.parse_args()
     with tempfile.TemporaryDirectory() as scratch:
-        home = asked.keep or Path(scratch)
+        home = options.keep or Path(scratch)
         home.mkdir(exist_ok=True, parents=True)
-        measure(asked, home)
+        measure(options, home)
 
 
-def measure(asked: argparse.Namespace, home: Path) -> None:
+def measure(options: argparse.Namespace, home: Path) -> None:
     """Simulate, reconstruct, compare; print a line of JSON."""
-    resting = asked.what == "still"
-    table = still_scene(home, asked.seed) if resting else load_scene("scene-fibre").model_dump(mode="json")
-    scene = SceneFile.model_validate({**table, **EFFECTS, "seed": asked.seed}).root
-    lines = asked.lines or (600 if resting else 1344)
-    rig = load_rig("rig-fibre", {"code.seed": asked.seed})
+    resting = options.what == "still"
+    table = still_scene(home, options.seed) if resting else load_scene("scene-fibre").model_dump(mode="json")
+    scene = SceneFile.model_validate({**table, **EFFECTS, "seed": options.seed}).root
+    lines = options.lines or (600 if resting else 1344)
+    rig = load_rig("rig-fibre", {"code.seed": options.seed})
     bare = bench_of(rig, scene).without("shot_noise", "read_noise")
     black = rig.cameras.a.black_level_dn
     brightest = max(
@@ -92,24 +92,24 @@ def measure(asked: argparse.Namespace, home: Path) -> None:
     responsivity = rig.cameras.a.responsivity_dn * TOP_DN / (brightest - black)
     cameras = {"responsivity_dn": responsivity, "dn_per_electron": K, "read_noise_e": READ_E}
     changes = {f"cameras.{arm}.{key}": value for arm in "ab" for key, value in cameras.items()}
-    rig = load_rig("rig-fibre", {"code.seed": asked.seed, **changes})
-    recording = home / f"{asked.what}-{asked.seed}.zarr"
+    rig = load_rig("rig-fibre", {"code.seed": options.seed, **changes})
+    recording = home / f"{options.what}-{options.seed}.zarr"
     began = time.monotonic()
     if not recording.exists():
         simulate(rig, scene, recording, lines)
     simulated_s = time.monotonic() - began
     opened = open_recording(recording)
-    tiles = tiles_of(opened, asked.tiles)
+    tiles = tiles_of(opened, options.tiles)
     span = opened.geometry_for(lines).span
-    voxels = Voxels(asked.nm or (1 if resting else 4), asked.tm or (span if resting else 16))
+    voxels = Voxels(options.nm or (1 if resting else 4), options.tm or (span if resting else 16))
     request = in_tiles(in_voxels(by_lines(opened), voxels), tiles)
     tasks = len(request.stretches) * len(tiles)
     watcher = Watcher(tasks, lambda done, of: print(f"{done:.1f} of {of}", end="\r", flush=True))
-    out = home / f"{asked.what}-{asked.seed}-{time.time_ns()}-video.zarr"
+    out = home / f"{options.what}-{options.seed}-{time.time_ns()}-video.zarr"
     began = time.monotonic()
-    with open_pool(tasks, asked.workers, None, watcher) as pool:
+    with open_pool(tasks, options.workers, None, watcher) as pool:
         outcome = combine(
-            opened, request, out, Options(asked.preset, shared=asked.search == "shared"), pool, watcher
+            opened, request, out, Options(options.preset, shared=options.search == "shared"), pool, watcher
         )
     seconds = time.monotonic() - began
     video, side = open_video(out), request.grid.side
@@ -125,8 +125,8 @@ def measure(asked: argparse.Namespace, home: Path) -> None:
         part = np.s_[:, row : row + side, column : column + side]
         by_tile[str(tile)] = [decibels(error[part].mean()), round(float(truth[part].std()), 3)]
     facts = {
-        "what": asked.what,
-        "seed": asked.seed,
+        "what": options.what,
+        "seed": options.seed,
         "lines": lines,
         "voxels": str(voxels),
         "frames": [len(kept), *found.shape[1:]],

@@ -1,4 +1,4 @@
-"""Cost of fibre bands beside their nominal positions, and the gain from aligning each tile.
+"""Cost of fibre bands that are displaced from their nominal positions, and the gain from aligning each tile.
 
     python tools/bench_fibre_bands.py
 
@@ -41,10 +41,10 @@ def main() -> None:
     )
     parser.add_argument("--seed", type=int, default=1, help="seed of texture, code, noise and shifts")
     parser.add_argument("--shifts", type=float, nargs="*", default=[0.0, 0.5, 1.0, 2.0], metavar="PIXELS")
-    asked = parser.parse_args()
+    options = parser.parse_args()
     with tempfile.TemporaryDirectory() as home:
-        for pixels in asked.shifts:
-            print(json.dumps(measured(Path(home), asked.seed, pixels)), flush=True)
+        for pixels in options.shifts:
+            print(json.dumps(measured(Path(home), options.seed, pixels)), flush=True)
 
 
 def measured(home: Path, seed: int, pixels: float) -> dict[str, object]:

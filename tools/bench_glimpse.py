@@ -72,7 +72,7 @@ def armed(directory: Path, stages: int, substeps: int) -> Iterator[Client]:
 
 
 class Viewer:
-    """Reads what the process says until it is closed; the first glimpse, which loads the loops, aside."""
+    """Reader of the process's output, except the first glimpse, which loads the loops."""
 
     def __init__(self, socket: Path) -> None:
         command = [sys.executable, "-m", "acquire.web.glimpse", str(socket)]

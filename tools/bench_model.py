@@ -74,9 +74,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("--iterations", type=int, default=80)
     add_option(parser)
-    asked = parser.parse_args()
-    with recorded("bench_model", keep=asked.record) as run:
-        measure(asked.iterations, run)
+    options = parser.parse_args()
+    with recorded("bench_model", keep=options.record) as run:
+        measure(options.iterations, run)
 
 
 def measure(iterations: int, run: Run) -> None:

@@ -141,10 +141,10 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--no-video", action="store_true")
     add_option(parser)
-    asked = parser.parse_args()
-    with recorded("bench_psf", keep=asked.record) as run:
-        for number in range(asked.instruments):
-            instrument(asked.seed + number, video=not asked.no_video, run=run)
+    options = parser.parse_args()
+    with recorded("bench_psf", keep=options.record) as run:
+        for number in range(options.instruments):
+            instrument(options.seed + number, video=not options.no_video, run=run)
 
 
 if __name__ == "__main__":

@@ -204,22 +204,22 @@ def main() -> None:
     parser.add_argument("--against-twist", action="store_true")
     parser.add_argument("--solvers", nargs="+", default=["admm", "twist", "twist-band"])
     add_option(parser)
-    asked = parser.parse_args()
+    options = parser.parse_args()
     warm = CASES["fig9"]
-    for solver in asked.solvers:  # compiles
+    for solver in options.solvers:  # compiles
         reconstruct(record(warm, 0)[1], *warm.merges, solver=solver, iterations=2)
-    with recorded("bench_reconstruct", keep=asked.record) as run:
-        if not asked.against_twist:
+    with recorded("bench_reconstruct", keep=options.record) as run:
+        if not options.against_twist:
             print(f"{'case':8}{'code':>5} {'solver':12}{'budget':>6}{'s':>7}{'steps':>6}", end="")
             print(f"{'PSNR dB':>8}{'goal':>6}{'predicts':>9}")
-        for name in asked.cases:
-            for seed in asked.seeds:
-                if asked.against_twist:
+        for name in options.cases:
+            for seed in options.seeds:
+                if options.against_twist:
                     against_twist(name, CASES[name], seed, run)
                 elif name == "pulses":
                     pulses(seed, run)
                 else:
-                    compare(name, CASES[name], seed, asked.solvers, run)
+                    compare(name, CASES[name], seed, options.solvers, run)
 
 
 if __name__ == "__main__":

@@ -47,15 +47,15 @@ def main() -> None:
     parser.add_argument("--lines", type=int, nargs="+", default=[1000, 4000])
     parser.add_argument("--iterations", type=int, default=10)
     add_option(parser)
-    asked = parser.parse_args()
+    options = parser.parse_args()
     context = multiprocessing.get_context("spawn")
-    with tempfile.TemporaryDirectory() as directory, recorded("bench_segments", keep=asked.record) as run:
+    with tempfile.TemporaryDirectory() as directory, recorded("bench_segments", keep=options.record) as run:
         path = Path(directory) / "stream.zarr"
-        simulate(load_rig("rig-demo"), load_scene("scene-leds"), path, max(asked.lines))
+        simulate(load_rig("rig-demo"), load_scene("scene-leds"), path, max(options.lines))
         print(f"{'lines':>8}{'frames/s':>10}{'pieces':>8}{'s':>8}{'MB here':>9}{'MB worker':>11}")
-        for lines in asked.lines:
+        for lines in options.lines:
             answer = context.Queue()
-            process = context.Process(target=measure, args=(path, lines, asked.iterations, answer))
+            process = context.Process(target=measure, args=(path, lines, options.iterations, answer))
             process.start()
             seconds, tasks, here, worker = answer.get()
             process.join()

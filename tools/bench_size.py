@@ -121,19 +121,19 @@ def main() -> None:
     parser.add_argument("--full-well", type=float, default=math.inf)
     parser.add_argument("--seconds", type=float, help="processor seconds, instead of those of each size")
     add_option(parser)
-    asked = parser.parse_args()
+    options = parser.parse_args()
     fresh = multiprocessing.get_context("spawn")
-    with recorded("bench_size", keep=asked.record) as run:
-        for stages in asked.stages:
-            for seed in asked.seeds:
+    with recorded("bench_size", keep=options.record) as run:
+        for stages in options.stages:
+            for seed in options.seeds:
                 size = SIZES[stages]
-                limit_s = asked.seconds or size.limit_s
+                limit_s = options.seconds or size.limit_s
                 with fresh.Pool(1) as pool:
-                    row = pool.apply(measure, (stages, seed, asked.full_well, limit_s))
-                told = f"{row.processor_s:.0f} of {limit_s:.0f} s, {row.memory_gb:.2f} GB, {row.ended}"
+                    row = pool.apply(measure, (stages, seed, options.full_well, limit_s))
+                cost = f"{row.processor_s:.0f} of {limit_s:.0f} s, {row.memory_gb:.2f} GB, {row.ended}"
                 how = f"{row.prior}, {row.cosines} cosines, {row.patterns} patterns"
                 print(
-                    f"M = {stages}, code {seed}: {row.psnr_db:.1f} dB of {size.goal_db:.0f}; {told}; {how};"
+                    f"M = {stages}, code {seed}: {row.psnr_db:.1f} dB of {size.goal_db:.0f}; {cost}; {how};"
                     f" blocks {row.prediction:.2%}; {row.curves}",
                     flush=True,
                 )

@@ -49,14 +49,14 @@ class Row:
         return self.default_db - self.still_db
 
 
-def measure(scene: str, seed: int, full_well_e: float, voxels: Voxels, asked: argparse.Namespace) -> Row:
+def measure(scene: str, seed: int, full_well_e: float, voxels: Voxels, options: argparse.Namespace) -> Row:
     camera = Camera(full_well_e) if np.isfinite(full_well_e) else CLEAN
-    whole = record(scene, seed, stages=asked.stages, lines=asked.lines, camera=camera)
+    whole = record(scene, seed, stages=options.stages, lines=options.lines, camera=camera)
     merges = voxels.spatial_merge, voxels.temporal_merge
     segment, truth = whole.segment, whole.truth(*merges)
-    still = reconstruct(segment, merges[0], segment.geometry.span, asked.preset, check=False).video
+    still = reconstruct(segment, merges[0], segment.geometry.span, options.preset, check=False).video
     begun = time.process_time()
-    result = reconstruct(segment, *merges, asked.preset, check=False)
+    result = reconstruct(segment, *merges, options.preset, check=False)
     processor_s = time.process_time() - begun
     facts = result.parameters
     patterns = f", {facts['patterns']} patterns" if "patterns" in facts else ""

@@ -56,11 +56,11 @@ def balance(run: Run, scenes: list[str], seeds: list[int]) -> None:
                 for name, known in (("without", True), ("with", False)):
                     result = reconstruct(replace(segment, balanced=known), 2, 8, "fast", check=False)
                     found[f"{name}_db"] = psnr(result.video[result.trusted], truth)
-                told = result.parameters["balance"]
-                run.add(f"{scene}, seed {seed}, {ratio}", **found, **told)
+                facts = result.parameters["balance"]
+                run.add(f"{scene}, seed {seed}, {ratio}", **found, **facts)
                 print(
                     f"{scene:9} {seed} {ratio:4} {found['without_db']:5.1f} → {found['with_db']:4.1f} dB  "
-                    f"{told['ratio']:.3f} ± {told['error']:.3f}{' corrected' * told['corrected']}",
+                    f"{facts['ratio']:.3f} ± {facts['error']:.3f}{' corrected' * facts['corrected']}",
                     flush=True,
                 )
 
@@ -103,14 +103,16 @@ def fast(run: Run, scenes: list[str], seeds: list[int]) -> None:
         for seed in seeds:
             for stages, lines in ((48, 200), (64, 263)):
                 result = reconstruct(record(scene, seed, stages=stages, lines=lines).segment, 3, 1, "fast")
-                told = [text for text in result.warnings if text.startswith("light changes")]
-                run.add(f"{scene}, seed {seed}, {stages} stages", told="; ".join(told))
-                counts[scene == FAST][0] += bool(told)
+                warnings = [text for text in result.warnings if text.startswith("light changes")]
+                run.add(f"{scene}, seed {seed}, {stages} stages", warnings="; ".join(warnings))
+                counts[scene == FAST][0] += bool(warnings)
                 counts[scene == FAST][1] += 1
-                if told or scene == FAST:
-                    print(f"{scene:9} {seed} {stages} stages: {told or 'nothing is reported'}", flush=True)
-    for has_lamp, (told_of, cases) in counts.items():
-        print(f"{'with' if has_lamp else 'without'} the lamp: reported in {told_of} of {cases}")
+                if warnings or scene == FAST:
+                    print(
+                        f"{scene:9} {seed} {stages} stages: {warnings or 'nothing is reported'}", flush=True
+                    )
+    for has_lamp, (reported, cases) in counts.items():
+        print(f"{'with' if has_lamp else 'without'} the lamp: reported in {reported} of {cases}")
 
 
 WAYS = {"balance": balance, "field": field, "fast": fast}

@@ -100,8 +100,8 @@ def main() -> None:
                 rows.append(row)
                 run.add(f"{scene}, seed {seed}", **figures(row))
                 yardsticks = f"{row.mean:5.1f}  {row.still:5.1f}  {row.cosines:7.1f}  {row.twist:5.1f}"
-                told = f"{row.ssim:4.2f}  {row.error:5.1%}  {row.processor_s:3.0f}   {row.prior}"
-                print(f"{row.scene:9} {yardsticks}  {row.default:7.1f}  {told}", flush=True)
+                details = f"{row.ssim:4.2f}  {row.error:5.1%}  {row.processor_s:3.0f}   {row.prior}"
+                print(f"{row.scene:9} {yardsticks}  {row.default:7.1f}  {details}", flush=True)
     worse = [row.scene for row in rows if row.default < row.still - SLACK_DB]
     print(f"default below the still by more than {SLACK_DB} dB: {len(worse)} of {len(rows)} {worse or ''}")
 

@@ -35,24 +35,24 @@ def main() -> None:
     for name, default in (("frames", 128), ("side", 64), ("iterations", 10)):
         parser.add_argument(f"--{name}", type=int, default=default)
     add_option(parser)
-    asked = parser.parse_args()
-    with recorded("bench_tv", keep=asked.record) as run:
-        measure(run, asked)
+    options = parser.parse_args()
+    with recorded("bench_tv", keep=options.record) as run:
+        measure(run, options)
 
 
-def measure(run: Run, asked: argparse.Namespace) -> None:
-    shape = (asked.frames, asked.side, asked.side)
+def measure(run: Run, options: argparse.Namespace) -> None:
+    shape = (options.frames, options.side, options.side)
     frames = np.random.default_rng(0).random(shape, np.float32)
-    tv = FrameTv(asked.iterations)
+    tv = FrameTv(options.iterations)
     tv.prox(frames, 0.1)  # compiles
     ours = best_ms(lambda: tv.prox(frames, 0.1))
 
     def library() -> None:
         for frame in frames:
-            denoise_tv_chambolle(frame, weight=0.1, eps=0.0, max_num_iter=asked.iterations)
+            denoise_tv_chambolle(frame, weight=0.1, eps=0.0, max_num_iter=options.iterations)
 
     theirs = best_ms(library)
-    case = f"{asked.frames} frames of {asked.side}², {asked.iterations} iterations"
+    case = f"{options.frames} frames of {options.side}², {options.iterations} iterations"
     run.add(case, acquire_ms=ours, scikit_image_ms=theirs, ratio=theirs / ours)
     print(case)
     print(f"acquire       {ours:8.1f} ms")

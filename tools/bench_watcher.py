@@ -57,11 +57,11 @@ def main() -> None:
     words = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     words.add_argument("--seconds", type=float, default=4.0, help="seconds of lines per case")
     add_option(words)
-    asked = words.parse_args()
-    with recorded("bench_watcher", keep=asked.record) as run:
+    options = words.parse_args()
+    with recorded("bench_watcher", keep=options.record) as run:
         for case in CASES:
             print(case.name)
-            found = measure(case, asked.seconds)
+            found = measure(case, options.seconds)
             for name, value in found.items():
                 print(f"  {name:<40} {f'{value:.3f}' if isinstance(value, float) else value}")
             run.add(case.name, **found)
@@ -85,10 +85,10 @@ def measure(case: Case, seconds: float) -> dict[str, Figure]:
         worker.expect(Ready, time.monotonic() + 30)
         before_s, begun_s = cpu_s(worker.pid), time.monotonic()
         producer.start()
-        told, slip_s = [], begun_s + seconds / 2
+        received, slip_s = [], begun_s + seconds / 2
         while producer.is_alive():
             if isinstance(message := worker.message(0.01), Checked):
-                told.append((time.monotonic(), message))
+                received.append((time.monotonic(), message))
         used_s, took_s = cpu_s(worker.pid) - before_s, time.monotonic() - begun_s
     finally:
         producer.join()
@@ -98,14 +98,14 @@ def measure(case: Case, seconds: float) -> dict[str, Figure]:
         counters.close()
         for ring in rings.values():
             ring.close()
-    slipped = [at - slip_s for at, message in told if message.doubtful]
+    slipped = [at - slip_s for at, message in received if message.doubtful]
     return {
         "watcher_cores": used_s / took_s,
         "copying_both_arms_cores": copying.value,
         "checks": checks,
         "noticed_after_s": slipped[0] if slipped else None,
         "slots_lost": lost,
-        "verdicts": "; ".join(message.text for _, message in told),
+        "verdicts": "; ".join(message.text for _, message in received),
     }
 
 

@@ -284,7 +284,7 @@ def _check_ledger(book: dict[str, object] | None, lines: int, missing: np.ndarra
     stored, lost = int(str(book["stored"])), sum(dict(book["missing"]).values())  # type: ignore[call-overload]
     if (stored + lost, lost) != (lines, int(missing.sum())):
         return [
-            f"arm {arm}: ledger says {stored} stored, {lost} missing of {lines} with {int(missing.sum())}"
+            f"arm {arm}: the ledger has {stored} stored, {lost} missing of {lines} with {int(missing.sum())}"
         ]
     return []
 

@@ -77,14 +77,14 @@ def faults(made: Packages, root: Path = ROOT) -> list[str]:
     program = {name for name in known if name.startswith("acquire/")}
     program |= {f"acquire/{name}" for name in known if name.startswith("configs/")}
     inside = {name for name in wheel if ".dist-info/" not in name}
-    told = {
+    differences = {
         "the source distribution lacks": known - packed,
         "the source distribution has, and the checkout does not": packed - known,
         "the wheel lacks": program - inside,
         "the wheel has, and the program does not": inside - program,
         "the wheel from the checkout and the one from the source distribution differ in": wheel ^ other,
     }
-    return [f"{what} {_few(names)}" for what, names in told.items() if names]
+    return [f"{what} {_few(names)}" for what, names in differences.items() if names]
 
 
 def _few(names: set[str], most: int = 5) -> str:

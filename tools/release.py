@@ -36,7 +36,7 @@ RULES = ("tests/contract/test_habits.py",)
 LIMIT_S = 3600
 
 
-class Undone(Exception):  # noqa: N818 - a thing to do, told like a result
+class Undone(Exception):  # noqa: N818 - a thing to do, reported like a result
     """An unmet condition, in words, and what ``todo`` about it."""
 
     def __init__(self, what: str, todo: str) -> None:
@@ -67,7 +67,7 @@ def version_is_new(root: Path) -> str:
     return f"{version}, of which there is no tag"
 
 
-def changelog_tells_it(root: Path) -> str:
+def changelog_describes_it(root: Path) -> str:
     """The newest section is that of this version, has entries, and a date in the past or (unreleased)."""
     text, version = (root / "CHANGELOG.md").read_text(encoding="utf-8"), version_of(root)
     headings = list(HEADING.finditer(text))
@@ -82,10 +82,10 @@ def changelog_tells_it(root: Path) -> str:
     if "\n- " not in text[newest.end() : end]:
         raise Undone(f"the section of {version} has no entry", "describe its changes")
     if newest[2] == "unreleased":
-        return f"tells of {version}; write the date in place of (unreleased) in the commit that is tagged"
+        return f"describes {version}; write the date in place of (unreleased) in the commit that is tagged"
     if _date(newest[2]) > date.today():
         raise Undone(f"{newest[2]} has not come yet", "correct the date")
-    return f"tells of {version}, {newest[2]}"
+    return f"describes {version}, {newest[2]}"
 
 
 def documents_hold(root: Path) -> str:
@@ -222,7 +222,7 @@ def _pytest(root: Path, *words: str) -> str:
 
 
 def _end(text: str) -> str:
-    return (text.strip().splitlines() or ["it said nothing"])[-1].strip("= ")
+    return (text.strip().splitlines() or ["it printed nothing"])[-1].strip("= ")
 
 
 # ---- the command
@@ -247,23 +247,23 @@ def main() -> int:
     parser.add_argument("--check", action="store_true", required=True, help="check, and change nothing")
     parser.add_argument("--tests", action="store_true", help="also run the whole suite")
     parser.add_argument("--all-pythons", action="store_true", help="try every supported Python")
-    asked = parser.parse_args()
-    programs = claimed() if asked.all_pythons else [sys.executable]
+    options = parser.parse_args()
+    programs = claimed() if options.all_pythons else [sys.executable]
     items: dict[str, Item] = {
         "tree": tree_is_clean,
         "version": version_is_new,
-        "changelog": changelog_tells_it,
+        "changelog": changelog_describes_it,
         "documents": documents_hold,
         "rules": rules_hold,
         "libraries": constraints_suit,
         "packages": packages_are_whole,
         "pythons": lambda root: pythons_run(root, programs),
     }
-    if asked.tests:
+    if options.tests:
         items["tests"] = tests_pass
     undone = check(items, ROOT)
-    left = [] if asked.tests else ["the whole suite (--tests)"]
-    left += [] if asked.all_pythons else ["the other Pythons (--all-pythons)"]
+    left = [] if options.tests else ["the whole suite (--tests)"]
+    left += [] if options.all_pythons else ["the other Pythons (--all-pythons)"]
     if left:
         print(f"– not checked: {', '.join(left)}")
     version = version_of(ROOT)

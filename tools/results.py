@@ -264,13 +264,13 @@ def main() -> int:
     parser.add_argument("--run", type=int, metavar="NUMBER", help="print this run of the list instead")
     parser.add_argument("--write", action="store_true", help="update the tables of the documents")
     parser.add_argument("--file", type=Path, default=FILE, help=f"file of runs, instead of tools/{FILE.name}")
-    asked = parser.parse_args()
+    options = parser.parse_args()
     try:
-        runs = read(asked.file)
-        if asked.table or asked.run is not None:
-            print(table(choose(runs, asked.table, asked.run)))
+        runs = read(options.file)
+        if options.table or options.run is not None:
+            print(table(choose(runs, options.table, options.run)))
             return 0
-        if asked.write:
+        if options.write:
             texts = [with_tables(path.read_text(encoding="utf-8"), runs) for path in DOCUMENTS]
             for path, text in zip(DOCUMENTS, texts, strict=True):
                 path.write_text(text, encoding="utf-8")

@@ -162,7 +162,7 @@ class Host:
 
     # ---- the end
 
-    def told_by_log(self) -> list[str]:
+    def failures_in_log(self) -> list[str]:
         """Unforeseen failures."""
         text = self._log.read_text(errors="replace")
         return (
@@ -243,7 +243,7 @@ class Host:
                 f"memory      {role}: {len(lives)} lives, {most:.1f} MB and {handles} descriptors at most;"
                 f" the longest, {(noted[-1][0] - noted[0][0]) / 60:.0f} min, from {noted[0][1]:.1f} to"
                 f" {noted[-1][1]:.1f} MB, "
-                + ("too short to tell" if grown is None else f"{grown:+.2f} MB in its second half")
+                + ("too short to judge" if grown is None else f"{grown:+.2f} MB in its second half")
                 + f" (more than {MOST_GROWTH_MB:g} would be wrong)"
             )
         if ends := getattr(self, "_ends", None):

@@ -152,7 +152,7 @@ class Operator:
             if type(error) is AcquireError:  # not a kind of error that a user can act on
                 self._night.wrong.append(f"{what}: {error}")
             time.sleep(0.5)
-        except Exception as error:  # noqa: BLE001 - it is told
+        except Exception as error:  # noqa: BLE001 - it is reported
             self._night.wrong.append(f"{what}: {type(error).__name__}: {error}")
             time.sleep(0.5)
 
@@ -371,7 +371,7 @@ def night_of(home: Path, minutes: float, seed: int, kill_s: float, *, browser: b
         strangers_out.set()
         for thread in (*others, keeping):
             thread.join()
-        night.wrong += host.told_by_log()
+        night.wrong += host.failures_in_log()
         night.wrong += host.judge()
     finally:
         ending.set()

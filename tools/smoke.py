@@ -118,7 +118,7 @@ def own_environment() -> dict[str, str]:
 
 
 def _last(text: str, most_lines: int = 12) -> str:
-    return "\n".join(text.strip().splitlines()[-most_lines:]) or "it said nothing"
+    return "\n".join(text.strip().splitlines()[-most_lines:]) or "it printed nothing"
 
 
 # ---- the steps
@@ -185,11 +185,11 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--program", type=Path, required=True, help="the installed acquire")
     parser.add_argument("--lab", action="store_true", help="also try the extra `report`")
-    asked = parser.parse_args()
+    options = parser.parse_args()
     good = True
-    for name, said, went in try_out(asked.program.absolute(), CORE | (LAB if asked.lab else {})):
-        print(f"{'✓' if went else '✗'} {name}: {said}", flush=True)
-        good &= went
+    for name, result, passed in try_out(options.program.absolute(), CORE | (LAB if options.lab else {})):
+        print(f"{'✓' if passed else '✗'} {name}: {result}", flush=True)
+        good &= passed
     return 0 if good else 1
 
 

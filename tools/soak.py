@@ -159,8 +159,8 @@ class Soak:
     def _memory(self, name: str) -> str:
         own = [mb for _, mb in self.memory[name]]
         growth = self.growth_mb(name)
-        told = "too short to tell" if growth is None else f"{growth:+.2f} MB in the second half"
-        return f"{name:9}{own[0]:.1f} MB first, {own[-1]:.1f} last, {max(own):.1f} most; {told}"
+        change = "too short to judge" if growth is None else f"{growth:+.2f} MB in the second half"
+        return f"{name:9}{own[0]:.1f} MB first, {own[-1]:.1f} last, {max(own):.1f} most; {change}"
 
 
 def soak(home: Path, lines: int, line_rate_hz: float, seed: int, cycle_s: float = CYCLE_S) -> Soak:

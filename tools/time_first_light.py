@@ -190,13 +190,13 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("--until", type=int, default=7)
     parser.add_argument("--json", type=Path)
-    asked = parser.parse_args()
+    options = parser.parse_args()
     found: list[Took] = []
     with tempfile.TemporaryDirectory() as directory:
         bench = Bench(Path(directory))
         bench.put("scene-practice")
         try:
-            for took in timed(bench, asked.until):
+            for took in timed(bench, options.until):
                 spent = took.seconds, took.processor_s, took.waited_s
                 print(row(str(took.step), *spent, took.command), flush=True)
                 found.append(took)
@@ -205,9 +205,9 @@ def main() -> None:
     total = [sum(getattr(each, name) for each in found) for name in ("seconds", "processor_s", "waited_s")]
     load = os.getloadavg()[0]
     print(row("all", *total, f"at a load of {load:.1f} on {os.cpu_count()} processors"))
-    if asked.json:
+    if options.json:
         rows = [asdict(each) for each in found]
-        asked.json.write_text(json.dumps({"load": load, "commands": rows}, indent=1), encoding="utf-8")
+        options.json.write_text(json.dumps({"load": load, "commands": rows}, indent=1), encoding="utf-8")
 
 
 if __name__ == "__main__":

@@ -14,8 +14,6 @@ if TYPE_CHECKING:
     from acquire.calibrate.calibration import Calibration
     from acquire.calibrate.exposure import Exposure, Moments
 
-QUANTISATION = 1 / 12
-"""Variance of rounding, DN²."""
 MOST_AT_ZERO = 1e-3
 """Share of a dark column's samples at 0 above which its mean is wrong."""
 MOST_SATURATED = 1e-3

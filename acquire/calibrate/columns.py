@@ -12,7 +12,6 @@ import numpy as np
 
 from acquire.calibrate.calibration import Finding, Measured, unusable_columns
 from acquire.calibrate.checks import (
-    QUANTISATION,
     offset_of,
     per_arm,
     refuse_clipped,
@@ -26,6 +25,7 @@ from acquire.calibrate.curve import straightened
 from acquire.calibrate.exposure import moments, no_progress
 from acquire.errors import UsageError
 from acquire.lines import ARMS
+from acquire.noise import QUANTISATION_DN2
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -68,7 +68,7 @@ def dark(exposure: Exposure, *, covered: bool = False, progress: Progress = no_p
     spread = np.median(np.abs(size - middle), axis=1, keepdims=True)
     usable: NDArray[np.bool_] = size - middle <= np.maximum(NOISY * spread, np.log(3.0))
     quantities = {
-        "offset_dn": Measured(found.mean, np.sqrt(np.maximum(found.variance, QUANTISATION) / lines)),
+        "offset_dn": Measured(found.mean, np.sqrt(np.maximum(found.variance, QUANTISATION_DN2) / lines)),
         "noise_dn": Measured(noise, noise / np.sqrt(2 * lines)),
     }
     facts = {**exposure.facts(), "covered": covered}
@@ -123,7 +123,7 @@ def flat(
     error = np.hypot(
         np.sqrt(found.variance / found.lines[:, None]), known.quantities["offset_dn"].uncertainty
     )
-    own_error = np.sqrt(np.maximum(found.own_variance, QUANTISATION) / found.lines[:, None])
+    own_error = np.sqrt(np.maximum(found.own_variance, QUANTISATION_DN2) / found.lines[:, None])
     relative = np.hypot(own_error, known.quantities["offset_dn"].uncertainty)
     relative = relative / np.where(alive, light, np.inf)  # a column without light has no gain
     # A fall-off at the outermost columns cannot be detected below the spread of the columns' own gains.

@@ -28,8 +28,6 @@ if TYPE_CHECKING:
     from acquire.calibrate.still import Still
     from acquire.lines import Segment
 
-MOVES = 3.0
-"""Misfit, relative to the lines' own noise, from which a target is not at rest."""
 MOST_LINES = 4096
 """Upper limit on the lines used; more do not make an alignment better than its model."""
 UNLIKE = 0.5

@@ -11,7 +11,6 @@ from acquire.calibrate.calibration import Finding, Measured
 from acquire.calibrate.checks import (
     LOWEST_LIGHT_DN,
     MOST_SATURATED,
-    QUANTISATION,
     offset_of,
     per_arm,
     refuse_coded,
@@ -20,6 +19,7 @@ from acquire.calibrate.curve import straightened
 from acquire.calibrate.exposure import moments, no_progress
 from acquire.errors import UsageError
 from acquire.lines import ARMS
+from acquire.noise import QUANTISATION_DN2
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -77,7 +77,7 @@ def transfer(
             )
     slopes = [_slope(sorted(points[arm], key=lambda point: point.light), arm) for arm in ARMS]
     K, error, full_dn = (np.array(each) for each in zip(*slopes, strict=True))
-    read = np.sqrt(np.maximum((dark_noise**2).mean(axis=1) - QUANTISATION, 0)) / K
+    read = np.sqrt(np.maximum((dark_noise**2).mean(axis=1) - QUANTISATION_DN2, 0)) / K
     read_error = read * np.hypot(error / K, 1 / np.sqrt(2.0 * dark_lines * offset.shape[1]))
     quantities = {"dn_per_electron": Measured(K, error), "read_noise_e": Measured(read, read_error)}
     if np.isfinite(full_dn).all():

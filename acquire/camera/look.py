@@ -14,7 +14,7 @@ from acquire.errors import CameraError
 from acquire.lines import LineFlag
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Mapping
+    from collections.abc import Callable, Mapping
 
     from numpy.typing import NDArray
 
@@ -49,20 +49,17 @@ def feature_table(camera: Camera, _: Callable[[], None]) -> list[dict[str, Any]]
     possible.
     """
     if isinstance(camera, FeatureCamera):
-        return list(_rows(camera.features()))
+        return [
+            {"module": module, "category": category, "feature": name, **_row(node)}
+            for module, tree in camera.features().items()
+            for category, names in tree.categories().items()
+            for name in names
+            if (node := tree.find(name)) is not None
+        ]
     return [
         {"module": "remote", "category": "", "feature": name, "value": value}
         for name, value in camera.settings().items()
     ]
-
-
-def _rows(modules: Mapping[str, FeatureTree]) -> Iterator[dict[str, Any]]:
-    for module, tree in modules.items():
-        for category, names in tree.categories().items():
-            for name in names:
-                node = tree.find(name)
-                if node is not None:
-                    yield {"module": module, "category": category, "feature": name, **_row(node)}
 
 
 def _row(node: Node) -> dict[str, Any]:

@@ -37,10 +37,10 @@ def visit(
     timeout_s: float = 30.0,
     armed: Callable[[], object] | None = None,
 ) -> T:
-    """Call ``look(camera, tell, *args)`` in a process that opens the camera; return its result or raise its
-    error.
+    """Call ``look(camera, report_armed, *args)`` in a process that opens the camera; return its result or
+    raise its error.
 
-    If ``armed`` is given, ``look`` must call ``tell``, upon which ``armed`` is called here. Raises
+    If ``armed`` is given, ``look`` must call ``report_armed``, upon which ``armed`` is called here. Raises
     DeviceError if the process does not answer within ``timeout_s``.
     """
     worker = Worker("camera", _visit, opener, look, args)

@@ -41,7 +41,7 @@ def search_rate(
     directory: Path,
     first_hz: float,
     seconds: float = RUN_S,
-    tell: Callable[[Trial], object] | None = None,
+    progress: Callable[[Trial], object] | None = None,
     most_runs: int = MOST_RUNS,
 ) -> list[Trial]:
     """Return all runs in order, of which the first is at ``first_hz``; `best` selects the result."""
@@ -53,8 +53,8 @@ def search_rate(
         except (DataError, DeviceError) as error:
             trial = Trial(rate, None, str(error))
         trials.append(trial)
-        if tell is not None:
-            tell(trial)
+        if progress is not None:
+            progress(trial)
         if trial.held:
             good = rate
         else:

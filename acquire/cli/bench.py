@@ -85,7 +85,7 @@ def bench(
     with stage_progress(f"recording up to {runs} times") as advance:
         reporter = _TrialReporter(advance, runs, aloud=not json)
         trials = search_rate(
-            load, directory, parts.line_rate_hz, seconds=seconds, tell=reporter, most_runs=runs
+            load, directory, parts.line_rate_hz, seconds=seconds, progress=reporter, most_runs=runs
         )
     found = best(trials)
     if json:

@@ -178,9 +178,7 @@ def _preview(selection: Selection, tiles: int, *, whole: bool | None) -> VideoRe
     stream = selection.stream
     size = stream.geometry(1).size
     side = min(2 * stream.substeps, size)
-    if (
-        tiles
-    ):  # a scene of many tiles is shown coarser: `PREVIEW_SIDE` voxels or more along each side of a tile
+    if tiles:  # shown coarser: `PREVIEW_SIDE` voxels or more along each side of a tile
         side = max(merge for merge in range(1, max(1, size // PREVIEW_SIDE) + 1) if not size % merge)
     begin, end = selection.extent(Voxels(1, 1), Voxels(1, 1), whole=False)
     lines = stream.sub_segment(Stretch(begin, end, Voxels(1, 1))).lines

@@ -102,7 +102,7 @@ class TriggerConfig(FrozenModel):
 
     @property
     def settled_s(self) -> dict[str, float]:
-        """Arm → delay (s) of a line's start after the light of its first sub-step goes on."""
+        """Arm → delay (s) of a line's start after the light of its first sub-step is switched on."""
         ticks = {"a": self.a.delay_ticks, "b": self.b.delay_ticks}
         return {arm: (self.light.lead_ticks + delay) / self.clock_hz for arm, delay in ticks.items()}
 

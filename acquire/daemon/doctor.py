@@ -132,7 +132,7 @@ def _governor() -> Finding:
     slow = sorted(found - {"performance", "schedutil", ""})
     if not slow:
         return Finding(
-            "frequency", "good", f"governor {', '.join(sorted(found)) or 'not told by this kernel'}"
+            "frequency", "good", f"governor {', '.join(sorted(found)) or 'not reported by this kernel'}"
         )
     return Finding(
         "frequency",
@@ -172,10 +172,10 @@ def _disk(directory: Path) -> Iterator[Finding]:
         yield Finding("disk", "bad", f"{path} is no directory", f"mkdir -p {path}, or recording.directory")
         return
     if not os.access(path, os.W_OK | os.X_OK):
-        yield Finding("disk", "bad", f"{path} is not ours to write", f"chown or chmod {path}")
+        yield Finding("disk", "bad", f"{path} is not writable for this user", f"chown or chmod {path}")
         return
     free_gb, kind = shutil.disk_usage(path).free / 1e9, _file_system(path)
-    text = f"{path}: {free_gb:.0f} GB free on {kind or 'a file system that is not told'}"
+    text = f"{path}: {free_gb:.0f} GB free on {kind or 'a file system of unknown type'}"
     if kind in NETWORK_DISKS:
         yield Finding(
             "disk", "warning", f"{text}: it waits for a network", "a local disk, and recording.upload_to"

@@ -172,7 +172,7 @@ class LedgerStatus(Message):
     lost: dict[str, int] = Field(description="cause → lines")
     waiting: int = Field(description="in the ring")
     pending: int = Field(
-        description="in camera or driver; once idle: lines there when the trigger stopped, in no recording"
+        description="in the camera or driver; once idle: left there when the trigger stopped, in no recording"
     )
     balanced: bool
 

@@ -64,14 +64,14 @@ class Run:
             return configured
         return self._choice.codec if self._choice else "none"
 
-    def arm(self, tell: Callable[[str], object] = lambda _: None) -> None:
+    def arm(self, progress: Callable[[str], object] = lambda _: None) -> None:
         """Start cameras and trigger; on failure everything is undone and the first error raised.
 
-        ``tell`` is called with each step being waited for.
+        ``progress`` is called with each awaited step.
         """
         if self._config.recording.codec == "auto":
             self._choice = self._choose(self._config)
-        self.capture.arm(self._config.stream.arm_timeout_s, tell)
+        self.capture.arm(self._config.stream.arm_timeout_s, progress)
 
     def adopt(self, recording: RecordingConfig) -> None:
         """Use the settings ``recording`` for the next recording."""

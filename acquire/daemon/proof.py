@@ -53,7 +53,7 @@ class Proof:
         return self._chosen[1]
 
     def __call__(
-        self, *, force: bool = False, tell: Callable[[str], object] = lambda _: None, fresh: bool = False
+        self, *, force: bool = False, progress: Callable[[str], object] = lambda _: None, fresh: bool = False
     ) -> CapacityStatus:
         """Return the sustained rate; ``fresh`` measures it again even if a recent result is valid.
 
@@ -62,7 +62,7 @@ class Proof:
         if fresh:
             self._chosen = self._measured = None
         try:
-            parts = self._parts(tell)
+            parts = self._parts(progress)
         except (UsageError, DataError) as error:
             log.warning("capacity: it cannot be measured: %s", error)
             rate_hz = self._config.line_rate_hz * self._config.simulation.speed
@@ -89,18 +89,18 @@ class Proof:
             warning=warning,
         )
 
-    def _parts(self, tell: Callable[[str], object]) -> Parts:
+    def _parts(self, progress: Callable[[str], object]) -> Parts:
         """Return a valid measurement, or make one; see the module for insufficient ones."""
         if self._measured is not None and time.monotonic() - self._measured[0] <= VALID_S:
             return self._measured[1]
-        tell("measuring what this host sustains")
+        progress("measuring what this host sustains")
         auto = self._config.recording.codec == "auto"
         load = Load.of(self._config, self.choose(self._config).codec if auto else None)
         best = measure_parts(load, self._directory)
         for attempt in range(2, TRIES + 1):
             if best.line_rate_hz >= load.line_rate_hz:
                 break
-            tell(f"measuring what this host sustains, {attempt} of {TRIES} (load {_load()})")
+            progress(f"measuring what this host sustains, {attempt} of {TRIES} (load {_load()})")
             best = max(best, measure_parts(load, self._directory), key=lambda parts: parts.line_rate_hz)
         if best.line_rate_hz >= load.line_rate_hz:
             self._measured = time.monotonic(), best

@@ -127,7 +127,7 @@ class Service:
             self._recovered(self._salvage.poll(capturing=True))
             self._uploads.prove(force=request.force)
             if self._prove is not None:
-                self._capacity = self._prove(force=request.force, tell=self._show)
+                self._capacity = self._prove(force=request.force, progress=self._show)
             run = self._open_run(request)
             run.arm(self._show)
             self._run, self._seen, self._rates = run, CaptureStatus(), Rates()
@@ -185,7 +185,7 @@ class Service:
         self._busy = "capacity"
         self._publish()
         try:
-            self._capacity = self._prove(force=True, fresh=True, tell=self._show)
+            self._capacity = self._prove(force=True, fresh=True, progress=self._show)
         finally:
             self._busy = None
             self._publish()

@@ -132,11 +132,11 @@ def _memory(rig: RigConfig) -> list[str]:
     """Return the settings for memory shortage, with comments for administrators who want to change them."""
     needed_mb = math.ceil((sum(needed_bytes(rig)) + PROCESSES_BYTES) / 1e6)
     return [
-        "# What the kernel kills where memory ends is replaced, and the capture goes on: the page's jobs go",
-        "# first, then page, recoveries, uploads. Where it kills the service, Restart= brings it back.",
+        "# A process that the kernel kills for lack of memory is replaced, and the capture continues.",
+        "# The page's jobs are killed first, then page, recoveries, uploads. Restart= restarts the service.",
         "OOMPolicy=continue",
-        "# Rings and processes keep their memory when others want it. MemoryMax= is not set: it",
-        "# would have to be more, by what the videos need that jobs of the page make.",
+        "# Rings and processes keep their memory when other programs need some. MemoryMax= is not set: it",
+        "# would have to include the memory of the videos that jobs of the page compute.",
         f"MemoryLow={needed_mb}M",
     ]
 

@@ -97,7 +97,9 @@ def frames(result: DemoResult) -> Figure:
     axes = figure.subplots(len(rows), len(picks), squeeze=False)
     for (label, video, is_error), row in zip(rows, axes, strict=True):
         for frame, ax in zip(picks, row, strict=True):
-            _show_frame(ax, result, video[frame], is_error=is_error)
+            look, white = ("inferno", ERROR_SHARE) if is_error else ("gray", 1.0)
+            ax.imshow(video[frame], cmap=look, vmin=0, vmax=white * result.peak)
+            bare(ax)
         row[0].set_ylabel(label, fontsize=8, fontweight="normal" if is_error else "bold")
     for frame, ax in zip(picks, axes[0], strict=True):
         stamp(ax, f"#{frame}\n{result.frame_ms[frame]:.2f} ms")
@@ -165,14 +167,6 @@ def _detail_window(result: DemoResult, row: int) -> tuple[float, float]:
     wanted_ms = share_ms if curve.constant else DETAIL_PERIODS * 1e3 / curve.theory.frequency_hz
     half = min(wanted_ms, last - first) / 2
     return (first + last) / 2 - half, (first + last) / 2 + half
-
-
-def _show_frame(ax: Axes, result: DemoResult, frame: NDArray[Any], *, is_error: bool) -> None:
-    if is_error:
-        ax.imshow(frame, cmap="inferno", vmin=0, vmax=ERROR_SHARE * result.peak)
-    else:
-        ax.imshow(frame, cmap="gray", vmin=0, vmax=result.peak)
-    bare(ax)
 
 
 def _colour_bar(figure: Figure, row: NDArray[Any], label: str, extend: str) -> None:

@@ -120,13 +120,9 @@ def _svg(figure: Figure) -> str:
     file = StringIO()
     with mpl.rc_context(SVG):
         figure.savefig(file, format="svg", transparent=True, metadata={"Date": None})
-    return _themed(file.getvalue())
-
-
-def _themed(svg: str) -> str:
-    svg = re.sub(
-        r' d="[^"]*"', lambda path: re.sub(r"(\.\d\d)\d+", r"\1", path[0]), svg
-    )  # round paths to 0.01 pt
+    # Round the paths to 0.01 pt.
+    svg = re.sub(r' d="[^"]*"', lambda path: re.sub(r"(\.\d\d)\d+", r"\1", path[0]), file.getvalue())
+    # Colours become variables, to which a rule in the drawing gives other values on dark screens.
     names = {colour: f"--ink{number}" for number, colour in enumerate(DARK)}
     for colour, name in names.items():
         svg = re.sub(rf"(?<=[:\s]){colour}\b", f"var({name})", svg)

@@ -150,7 +150,11 @@ def _value_axis(ax: Axes, metric: Metric) -> None:
 
 def frames(run: Run, truth: NDArray[Any] | None) -> Figure:
     """Draw one frame after more and more time of one run, and the same frame of the truth."""
-    points = _spread(run.points)
+    # Up to five points, evenly spaced in the logarithm of time, including the first and the last.
+    wanted = np.geomspace(run.points[0].seconds, run.points[-1].seconds, FRAMES)
+    times = np.array([each.seconds for each in run.points])
+    places = {int(np.argmin(np.abs(np.log(times / at)))) for at in wanted}
+    points = [run.points[place] for place in sorted(places)]
     peak = white(run, truth)
     with mpl.rc_context(STYLE):
         figure = canvas(3.5, WIDTH_IN)
@@ -174,14 +178,6 @@ def white(run: Run, truth: NDArray[Any] | None) -> float:
     shown = run.end.frame if truth is None else truth
     assert shown is not None
     return float(np.quantile(shown, 0.999)) or 1.0
-
-
-def _spread(points: Sequence[Point]) -> list[Point]:
-    """Choose up to five points, evenly spaced in the logarithm of time, including the first and the last."""
-    wanted = np.geomspace(points[0].seconds, points[-1].seconds, FRAMES)
-    times = np.array([each.seconds for each in points])
-    places = {int(np.argmin(np.abs(np.log(times / at)))) for at in wanted}
-    return [points[place] for place in sorted(places)]
 
 
 def in_caption(point: Point) -> str:

@@ -166,7 +166,7 @@ def _late(by: int) -> str:
 
 
 def _rows(model: LineModel, inquiry: Inquiry) -> list[Row]:
-    """The table: common mistakes, each by itself, and the candidates that were found, likeliest first."""
+    """The table: common mistakes, one at a time, and the candidates that were found, likeliest first."""
     described = inquiry.described
     S, plain = model.substeps, described.hypothesis
     tried = [replace(plain, late=(by, by)) for by in (1, -1, S, -S)]

@@ -13,7 +13,7 @@ slow and bright, whose residuals hide a fast lamp, more so the larger the sensor
 
 Rows of real scenes are alike, not independent, so that rest and slow motion leave a rough floor that falls
 with k. A lamp stands out of its neighbouring cosines: one of steady rhythm is a peak of two or three of them.
-The scatter of the others shows how high the highest of so many is by chance. Light of all frequencies up to
+The scatter of the others shows how high the highest of as many is by chance. Light of all frequencies up to
 some limit has no peak and is not found here. The rows are as wide as pixels; coarser ones cannot represent
 bright edges, whose residuals look like light of all frequencies.
 """

@@ -144,5 +144,5 @@ class Reconstruction:
             "trusted": f"frames {trusted.start} to {trusted.stop - 1}" if trusted else "none",
             "solver": f"{self.solver}, {self.iterations} iterations, {self.seconds:.3g} s ({self.ended})",
             "misfit": f"{self.quality.misfit:.2%}",
-            "error": f"cannot be told: {self.error}" if isinstance(self.error, str) else self.error.sentence,
+            "error": f"unknown: {self.error}" if isinstance(self.error, str) else self.error.sentence,
         }

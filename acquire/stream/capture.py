@@ -80,8 +80,8 @@ class Capture:
         self._final: CaptureStatus | None = None
         self._used = self._closed = self._emptied = False
 
-    def arm(self, timeout_s: float = 120.0, tell: Callable[[str], object] = lambda _: None) -> None:
-        """Start everything; lines flow and are discarded. ``tell`` is called with each step being waited for.
+    def arm(self, timeout_s: float = 120.0, progress: Callable[[str], object] = lambda _: None) -> None:
+        """Start everything; lines flow and are discarded. ``progress`` is called with each awaited step.
 
         On failure everything is undone and the first error raised: the camera's or trigger's own, or
         DeviceError for a process that dies, or does not answer within ``timeout_s`` of the one before it.
@@ -90,7 +90,7 @@ class Capture:
             raise StateError("arm: this capture has been used", hint="make another")
         self._used = True
         try:
-            self._begin(timeout_s, tell)
+            self._begin(timeout_s, progress)
         except BaseException as error:
             try:
                 self.close(_UNDO_S)
@@ -172,8 +172,8 @@ class Capture:
 
     # ---- begin
 
-    def _begin(self, timeout_s: float, tell: Callable[[str], object]) -> None:
-        tell("memory for the rings")
+    def _begin(self, timeout_s: float, progress: Callable[[str], object]) -> None:
+        progress("memory for the rings")
         self._make_memory()
         # Start all before waiting for any: a camera takes seconds to open.
         self._workers[RECORDER] = self._new_recorder()
@@ -184,10 +184,10 @@ class Capture:
         facts: dict[str, dict[str, Any]] = {}
         for name, worker in self._workers.items():
             cameras = self._plan.grabbers.get(name, ())
-            tell(f"{worker.name}: {'the camera is being opened' if cameras else 'starting'}")
+            progress(f"{worker.name}: {'the camera is being opened' if cameras else 'starting'}")
             facts |= dict.fromkeys(cameras, worker.expect(Ready, time.monotonic() + timeout_s).facts)
         self.cameras = facts
-        tell("trigger")
+        progress("trigger")
         self._trigger_used = True  # from now on it has to be stopped, even if `prepare` fails
         # The trigger starts last: both cameras wait for it by now, and count from its first pulse.
         self._trigger.prepare(self._plan.run)

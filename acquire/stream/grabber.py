@@ -234,7 +234,7 @@ class Intake:
         line = None if block.time_ns is None else self._clock.line_at(block.time_ns)
         if line is None:
             raise CameraError(
-                f"camera {self._plan.arm} is back, but its time stamps do not tell at which line",
+                f"camera {self._plan.arm} is back, but its time stamps do not show at which line",
                 hint="arm again",
             )
         self._away = False

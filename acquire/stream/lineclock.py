@@ -2,7 +2,7 @@
 
 The trigger issues lines at even intervals, and a camera stamps its blocks. From both follows the line
 interval in the camera's time, and how much faster the camera's clock runs than the trigger's (its drift). A
-camera that was away counts from 0 again; its time stamps tell with which line it continues.
+camera that was away counts from 0 again; its time stamps show with which line it continues.
 """
 
 from __future__ import annotations

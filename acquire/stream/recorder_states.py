@@ -34,7 +34,7 @@ STATES = tuple(RecorderState)
 """In shared memory a state is its index in this tuple."""
 
 MEANINGS = {
-    RecorderState.WAITING: "the recorder has not been told yet that the run has started",
+    RecorderState.WAITING: "the recorder has not received the start of the run yet",
     RecorderState.DISCARDING: "nothing is being recorded",
     RecorderState.OPENING: "a recording is being created",
     RecorderState.CANCELLED: "a recording that was cancelled is being removed",

@@ -64,7 +64,7 @@ class Device:
 
     Attributes
     ----------
-    capabilities : what it says of itself
+    capabilities : as reported by the device
     """
 
     def __init__(self, link: Link) -> None:

@@ -33,7 +33,7 @@ from acquire.trigger.registers import (
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator, Sequence
+    from collections.abc import Iterable, Sequence
 
 _UNSENT = Frame(0, 0)
 _EMPTY_DATA_BYTES = len(encode(Frame(FrameType.DATA, 0, bytes(2))))
@@ -140,7 +140,20 @@ class Dialogue:
 
     def to_send(self, now_s: float) -> bytes:
         """Return requests for which the window has room, oldest first; they count as sent at ``now_s``."""
-        return b"".join(self._launch(now_s))
+        launched, room_bytes = [], self._room_bytes
+        while self._queued and self._fits(self._queued[0], room_bytes):
+            call = self._queued.popleft()
+            # Every attempt has a new number, so that a late answer to the previous one is not taken for its.
+            call.frame = Frame(call.kind, self._sequence, call.payload)
+            call.begun_s, call.sent_s = call.begun_s if call.attempts else now_s, now_s
+            call.attempts += 1
+            self._counts["repeated"] += call.attempts > 1
+            self._on_the_way[self._sequence] = call
+            # 16 bits, and far fewer requests in a window: no two on the way have the same number.
+            self._sequence = self._sequence + 1 & 0xFFFF
+            room_bytes -= call.size_bytes
+            launched.append(encode(call.frame))
+        return b"".join(launched)
 
     def receive(self, data: bytes, now_s: float) -> list[TagArrival]:
         """Take bytes in any pieces: answers settle their calls, tags are returned, the rest is counted."""
@@ -182,21 +195,6 @@ class Dialogue:
     def _fits(self, call: Call, room_bytes: int) -> bool:
         # One request may always be on the way, even if it exceeds the device's stated capacity.
         return call.size_bytes <= room_bytes or not self._on_the_way
-
-    def _launch(self, now_s: float) -> Iterator[bytes]:
-        room_bytes = self._room_bytes
-        while self._queued and self._fits(self._queued[0], room_bytes):
-            call = self._queued.popleft()
-            # Every attempt has a new number, so that a late answer to the previous one is not taken for its.
-            call.frame = Frame(call.kind, self._sequence, call.payload)
-            call.begun_s, call.sent_s = call.begun_s if call.attempts else now_s, now_s
-            call.attempts += 1
-            self._counts["repeated"] += call.attempts > 1
-            self._on_the_way[self._sequence] = call
-            # 16 bits, and far fewer requests in a window: no two on the way have the same number.
-            self._sequence = self._sequence + 1 & 0xFFFF
-            room_bytes -= call.size_bytes
-            yield encode(call.frame)
 
     def _due_s(self, call: Call) -> float:
         """Return when the call is overdue.

@@ -10,7 +10,7 @@ WORD_BITS = 32
 Access = Literal["constant", "read", "config", "operand", "command"]
 """Access of a register:
 
-``constant`` never changes; ``read`` changes by itself; ``config`` is written while no run is armed or
+``constant`` never changes; ``read`` is changed by the device; ``config`` is written while no run is armed or
 running, and reads back; ``operand`` is written at any time and reads back; ``command`` acts when written
 and reads as 0.
 """

@@ -179,19 +179,15 @@ def answers(request: Frame, answer: Frame) -> bool:
     # The sequence alone is not enough: every program begins at 0, and late answers to the previous one may
     # come.
     try:
-        return answer.type == FrameType.NAK or _matches(request, answer)
+        if request.type == FrameType.READ and answer.type == FrameType.DATA:
+            address, words = parse_write(answer.payload)
+            return parse_read(request.payload) == (address, len(words))
+        if request.type == FrameType.WRITE and answer.type == FrameType.ACK:
+            address, words = parse_write(request.payload)
+            return parse_read(answer.payload) == (address, len(words))
     except FrameLengthError:
         return False
-
-
-def _matches(request: Frame, answer: Frame) -> bool:
-    if request.type == FrameType.READ and answer.type == FrameType.DATA:
-        address, words = parse_write(answer.payload)
-        return parse_read(request.payload) == (address, len(words))
-    if request.type == FrameType.WRITE and answer.type == FrameType.ACK:
-        address, words = parse_write(request.payload)
-        return parse_read(answer.payload) == (address, len(words))
-    return False
+    return answer.type == FrameType.NAK
 
 
 def _demand(right: bool, payload: bytes) -> None:

@@ -1,7 +1,6 @@
-"""The words of the trigger's protocol besides its registers: frames, commands, states, errors, tags.
+"""The trigger's protocol apart from its registers: frames, commands, states, errors, tags.
 
-Registers and everything here reach the rest of the program, and the gateware, by way of
-`acquire.trigger.registers`.
+The rest of the program and the gateware import everything here from `acquire.trigger.registers`.
 """
 
 from __future__ import annotations
@@ -11,10 +10,10 @@ from enum import IntEnum, IntFlag
 from typing import NamedTuple
 
 PROTOCOL_VERSION = 1
-"""In every frame; a frame of another version is refused with BAD_VERSION."""
+"""Version in every frame; a frame with another version is refused with BAD_VERSION."""
 MAX_PAYLOAD = 240
 MAX_WORDS = 59
-"""Words of one read or write: their payload is at most 2 + 4·59 = 238 bytes."""
+"""Largest number of words of one read or write: the payload is at most 2 + 4·59 = 238 bytes."""
 TIME_BITS = 48
 
 
@@ -26,11 +25,11 @@ class Command(IntEnum):
     START = 2
     """Start the armed run RUN_ID."""
     STOP = 3
-    """End run RUN_ID, or any run if RUN_ID is 0, after the line that runs; light off."""
+    """End run RUN_ID, or any run if RUN_ID is 0, after the current line, with the light off."""
     CHECK_CODE = 4
     """Compute CODE_CRC over CODE_LENGTH bits, rounded up to words."""
     SELF_TEST = 5
-    """Test the device; what the code memory held is lost."""
+    """Test the device; the contents of the code memory are lost."""
 
 
 class State(IntEnum):
@@ -39,13 +38,13 @@ class State(IntEnum):
     IDLE = 0
     """No run has been armed since power-up."""
     ARMED = 1
-    """Waits for START or the external edge; dark."""
+    """The device waits for START or the external edge; the light is off."""
     RUNNING = 2
-    """Lines are done, or the first is about to begin."""
+    """Lines are being carried out, or the first is about to begin."""
     STOPPING = 3
-    """The last line runs."""
+    """The last line is being carried out."""
     ENDED = 4
-    """The run is over and the light off; STATUS.end_reason says why."""
+    """The run is over and the light is off; STATUS.end_reason gives the reason."""
 
 
 class EndReason(IntEnum):
@@ -54,63 +53,63 @@ class EndReason(IntEnum):
     NONE = 0
     """No run has ended since the latest ARM."""
     STOPPED = 1
-    """By STOP."""
+    """The run was ended by STOP."""
     LINE_BUDGET = 2
-    """LINE_BUDGET lines are done."""
+    """LINE_BUDGET lines have been carried out."""
     WATCHDOG = 3
-    """No valid request for WATCHDOG clocks."""
+    """There was no valid request for WATCHDOG clocks."""
     CLOCK_LOST = 4
     """The PLL lost its reference."""
 
 
 class ErrorCode(IntEnum):
-    """Why a request was refused (NAK). From 32 on: why a configuration cannot be armed."""
+    """Reasons for a NAK. From 32 on: reasons why a configuration cannot be armed."""
 
     BAD_VERSION = 1
-    """A frame of another protocol version; the answer is a frame of the device's."""
+    """The frame has another protocol version; the answer has the device's."""
     BAD_TYPE = 2
-    """Neither READ nor WRITE."""
+    """The type is neither READ nor WRITE."""
     BAD_LENGTH = 3
-    """The payload is not as its type has it, or asks for 0 or too many words."""
+    """The payload does not have the form of its type, or requests 0 or too many words."""
     BAD_ADDRESS = 4
-    """Beyond the map or the code memory; or a word other than 0 for an address without a register."""
+    """The address is beyond the map or the code memory, or has no register and the word is not 0."""
     READ_ONLY = 5
-    """A WRITE to a register of access constant or read."""
+    """A WRITE to a register with access constant or read."""
     BUSY = 6
-    """A configuration, code word, check or test while a run is armed or running; or another run's ARM."""
+    """A configuration, code word, check or test while a run is armed or running, or ARM of another run."""
     BAD_COMMAND = 7
-    """No such command."""
+    """There is no such command."""
     WRONG_RUN = 8
     """START or STOP of a run that is not the current one."""
     RUN_OVER = 9
-    """ARM of the run that has just ended: a run id is used once."""
+    """ARM of the run that has just ended: a run id can be used only once."""
     NOT_ARMED = 10
     """START before any run was armed."""
     BAD_RUN_ID = 11
     """ARM with run id 0."""
 
     BAD_SUBSTEP = 32
-    """SUBSTEP_CLOCKS outside of LIMITS."""
+    """SUBSTEP_CLOCKS is outside LIMITS."""
     BAD_SUBSTEPS = 33
-    """S not in CAPABILITIES."""
+    """S is not in CAPABILITIES."""
     BAD_PHASES = 34
     """The 6/S sub-phases of PHASE_CLOCKS do not fit into a sub-step."""
     BAD_SOURCE = 35
-    """CODE_SOURCE.kind is no Source."""
+    """CODE_SOURCE.kind is not a Source."""
     BAD_SEED = 36
-    """PRBS with mask or seed 0."""
+    """The source is PRBS, and its mask or seed is 0."""
     BAD_CODE_LENGTH = 37
-    """CODE_LENGTH is 0 or more than CODE_BITS: at ARM with source MEMORY, at CHECK_CODE with any."""
+    """CODE_LENGTH is 0 or more than CODE_BITS (ARM with source MEMORY, CHECK_CODE with any source)."""
     CODE_UNCHECKED = 38
-    """Code words, or CODE_LENGTH, were written after the last CHECK_CODE."""
+    """Code words or CODE_LENGTH were written after the last CHECK_CODE."""
     BAD_WINDOW = 39
-    """Not WINDOW_OPEN < WINDOW_CLOSE <= SUBSTEP_CLOCKS."""
+    """WINDOW_OPEN < WINDOW_CLOSE <= SUBSTEP_CLOCKS does not hold."""
     BAD_LEAD = 40
     """LED.lead + LIMITS.lead_margin > SUBSTEP_CLOCKS."""
     BAD_TRIGGER_A = 41
-    """Width 0, or delay + width >= the distance of A's pulses."""
+    """The width is 0, or delay + width >= the period of A's pulses."""
     BAD_TRIGGER_B = 42
-    """The same of B."""
+    """The same for B."""
     BAD_MIN_PERIOD = 43
     """Pulses would be closer than CAMERA_MIN_PERIOD."""
     BAD_TAG_INTERVAL = 44
@@ -123,20 +122,20 @@ class Source(IntEnum):
     """CODE_SOURCE.kind."""
 
     CONSTANT = 0
-    """CODE_SOURCE.value in every sub-step."""
+    """CODE_SOURCE.value is the bit of every sub-step."""
     PRBS = 1
     """The shift register of PRBS_MASK and PRBS_SEED."""
     MEMORY = 2
-    """The code memory's first CODE_LENGTH bits, again and again."""
+    """The first CODE_LENGTH bits of the code memory, repeated."""
 
 
 class LineMode(IntEnum):
-    """LINE.mode: when trigger outputs A and B pulse."""
+    """LINE.mode: when the trigger outputs A and B pulse."""
 
     PER_LINE = 0
     """Once, at the start of each line."""
     PER_SUBSTEP = 1
-    """A camera line per sub-step, as the paper's setup emulates S = 3."""
+    """Once per sub-step, which is then a camera line, as the paper's setup emulates S = 3."""
 
 
 class Board(IntEnum):
@@ -162,22 +161,22 @@ class FrameType(IntEnum):
     DATA = 0x81
     """Answer to READ."""
     ACK = 0x82
-    """Answer to WRITE: done."""
+    """Answer to WRITE: carried out."""
     NAK = 0x83
     """Answer to either: refused."""
     TAG = 0x90
-    """From the device, unasked: a line or an event of the run."""
+    """From the device, unsolicited: a line or an event of the run."""
 
 
 class TagFlag(IntFlag):
-    """Why a tag was sent. Every tag has at least one of them."""
+    """Reasons for a tag. Every tag has at least one of them."""
 
     LINE = 1 << 0
-    """The time stamp is that of the start of ``line``: every TAG_INTERVAL lines, from line 0 on."""
+    """The time stamp is that of the start of ``line``. Sent every TAG_INTERVAL lines, from line 0 on."""
     FIRST = 1 << 1
-    """Line 0; has LINE as well."""
+    """Line 0; LINE is set as well."""
     LAST = 1 << 2
-    """The run has ended; ``line`` is the last one. (No line was started: line = 0 and NO_LINES.)"""
+    """The run has ended; ``line`` is the last one. (If no line was started: line = 0 and NO_LINES.)"""
     NO_LINES = 1 << 3
     """With LAST: the run ended before its first line."""
     EXTERNAL = 1 << 4
@@ -185,29 +184,29 @@ class TagFlag(IntFlag):
     BUDGET = 1 << 5
     """With LAST: the line budget is used up."""
     WATCHDOG = 1 << 6
-    """With LAST: no valid request for WATCHDOG clocks."""
+    """With LAST: there was no valid request for WATCHDOG clocks."""
     CLOCK_LOST = 1 << 7
     """With LAST: the reference clock was lost."""
     PPS = 1 << 8
-    """A pulse-per-second edge came; PPS_TIME has its instant."""
+    """There was a pulse-per-second edge; PPS_TIME has its time."""
     MISSED_A = 1 << 9
     """The first missed strobe of camera A in this run."""
     MISSED_B = 1 << 10
-    """The same of B."""
+    """The same for B."""
     UNEXPECTED_A = 1 << 11
     """The first unexpected strobe of camera A in this run."""
     UNEXPECTED_B = 1 << 12
-    """The same of B."""
+    """The same for B."""
     TAGS_LOST = 1 << 13
-    """Tags before this one found the FIFO full; TAG_LOST has their number."""
+    """Tags before this one were lost because the FIFO was full; TAG_LOST has their number."""
 
 
 class TagRecord(NamedTuple):
-    """What a tag's payload says. ``run`` is the low half of the run id.
+    """Payload of a tag. ``run`` is the low half of the run id.
 
-    Without LINE in ``flags`` it tells of an event: ``line`` and ``code_index`` are those of the latest
-    line, ``timestamp`` is the event's, at most 15 clocks late, or that of the clock in which a full queue
-    had room for it.
+    Without LINE in ``flags`` the tag reports an event: ``line`` and ``code_index`` are those of the latest
+    line, and ``timestamp`` is that of the event, at most 15 clocks late, or, if the queue was full, of the
+    clock in which there was room.
     """
 
     run: int
@@ -225,7 +224,7 @@ _TAG = struct.Struct("<IIHQIHH")
 
 
 def pack_tag(tag: TagRecord) -> bytes:
-    """A tag's payload."""
+    """Return a tag's payload."""
     line, time = tag.line, tag.timestamp
     return _TAG.pack(
         tag.run, line & 0xFFFFFFFF, line >> 32, tag.code_index, time & 0xFFFFFFFF, time >> 32, tag.flags
@@ -233,6 +232,6 @@ def pack_tag(tag: TagRecord) -> bytes:
 
 
 def unpack_tag(payload: bytes) -> TagRecord:
-    """The tag of a payload of `TAG_BYTES`; struct.error for another length."""
+    """Return the tag of a payload of `TAG_BYTES` bytes. Raises struct.error for another length."""
     run, line_low, line_high, code_index, time_low, time_high, flags = _TAG.unpack(payload)
     return TagRecord(run, line_high << 32 | line_low, code_index, time_high << 32 | time_low, flags)

@@ -28,11 +28,11 @@ if TYPE_CHECKING:
 
     from acquire.trigger.registers import Register
 
-_NOTE = "<!-- Made by tools/registers_table.py from acquire/trigger/registers.py: change that. -->"
+_NOTE = "<!-- Made by tools/registers_table.py from acquire/trigger/registers.py: edit that file. -->"
 
 
 def registers_markdown() -> str:
-    """``firmware/REGISTERS.md``."""
+    """Return the text of ``firmware/REGISTERS.md``."""
     lines = [
         _NOTE,
         "",
@@ -42,13 +42,13 @@ def registers_markdown() -> str:
         "",
         "## Access",
         "",
-        "constant: never changes. read: changes by itself. config: written while no run is armed or "
-        "running, and reads back. operand: written at any time, and reads back. command: acts when written, "
-        "reads as 0.",
+        "constant: never changes. read: changed by the device. config: can be written while no run is armed "
+        "or running, and reads back. operand: can be written at any time, and reads back. command: acts when "
+        "written, and reads as 0.",
         "",
-        "Bits are counted from the low one of the register's first word. The reset value is the one at "
-        "power-up. The numbers that a field can take are in [PROTOCOL.md](PROTOCOL.md). Before all else a "
-        "host compares ID, VERSION.protocol and MAP with what is here.",
+        "Bits are counted from the lowest bit of the register's first word. The reset value is the value at "
+        "power-up. The values of a field are listed in [PROTOCOL.md](PROTOCOL.md). A host must first compare "
+        "ID, VERSION.protocol and MAP with the values given here.",
         "",
         "## Map",
         "",
@@ -61,7 +61,7 @@ def registers_markdown() -> str:
 
 
 def protocol_markdown() -> str:
-    """``firmware/PROTOCOL.md``."""
+    """Return the text of ``firmware/PROTOCOL.md``."""
     kinds: dict[str, type[IntEnum | IntFlag]] = {
         "types": FrameType,
         "commands": Command,
@@ -94,22 +94,19 @@ def _tag_rows() -> Iterator[str]:
 
 
 def _rows(register: Register) -> Iterator[str]:
+    # A constant has a reset value here only if it is the same in all devices.
+    known = register.access != "constant" or register.reset
+    reset = f"{register.reset:#x}" if known else "by device"
+    if register is registers.MAP:
+        reset = f"{registers.MAP_CRC:#x}"
     yield (
         f"| 0x{register.address:04x} | {register.name} | {register.width} | {register.access} "
-        f"| {_reset(register)} | {register.doc} |"
+        f"| {reset} | {register.doc} |"
     )
     for field in register.fields:
         top = field.low + field.width - 1
         bits = str(field.low) if field.width == 1 else f"{top}:{field.low}"
         yield f"| | .{field.name} | {bits} | | | {field.doc} |"
-
-
-def _reset(register: Register) -> str:
-    """Return the value at power-up; of a constant, its value if it is the same in all devices."""
-    if register is registers.MAP:
-        return f"{registers.MAP_CRC:#x}"
-    known = register.access != "constant" or register.reset
-    return f"{register.reset:#x}" if known else "by device"
 
 
 def _enum_table(kind: type[IntEnum | IntFlag]) -> str:

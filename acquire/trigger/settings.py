@@ -195,7 +195,7 @@ def _check_pulses(config: TriggerConfig, distance: int) -> None:
     if distance < config.camera_min_period_ticks:
         raise TriggerError(
             f"the camera pulses are only {distance} ticks apart",
-            possible=f"{config.camera_min_period_ticks} or more, as trigger.camera_min_period_ticks says",
+            possible=f"{config.camera_min_period_ticks} or more (trigger.camera_min_period_ticks)",
             hint="a longer trigger.substep_ticks",
         )
 

@@ -64,8 +64,8 @@ class Ulx3s(Elaboratable):
 def _pll(reference: Signal, clock: Signal, locked: Signal) -> Instance:
     """The oscillator runs at 25 MHz · 18 = 450 MHz, a fifth of which is 90 MHz.
 
-    Its eighteenth is compared with the reference itself, at 25 MHz: the maker wants 10 MHz or more there, and
-    400 to 800 MHz of the oscillator.
+    Its eighteenth is compared with the reference itself, at 25 MHz: the manufacturer requires 10 MHz or
+    more there, and 400 to 800 MHz for the oscillator.
     """
     feedback = Signal()
     return Instance(

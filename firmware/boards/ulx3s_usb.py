@@ -49,7 +49,7 @@ class Ulx3sUsb(Ulx3s):
 def _usb_pll(reference: Value, usb: Signal, usb_io: Signal) -> Instance:
     """The oscillator at 480 MHz, divided by 10 and 40 for 48 and 12 MHz; 480 / 48 is compared with 90 / 9.
 
-    From 25 MHz the comparison would be at 5 MHz; the maker requires 10.
+    From 25 MHz the comparison would be at 5 MHz; the manufacturer requires 10.
     """
     feedback = Signal()
     return Instance(

@@ -17,7 +17,7 @@ from rich.table import Table
 from firmware.formal.engine import prove
 from firmware.formal.mutants import MUTANTS, broken_by
 from firmware.formal.proofs import PROOFS
-from firmware.toolchain import LOG, ToolError, tell_progress
+from firmware.toolchain import LOG, ToolError, log_progress
 
 OUTPUT = Console()
 
@@ -36,7 +36,7 @@ def main() -> int:
     if unknown := set(chosen.names) - set(PROOFS):
         parser.error(f"no proof {', '.join(sorted(unknown))}; there are {', '.join(PROOFS)}")
     names = chosen.names or list(PROOFS)
-    tell_progress()
+    log_progress()
     try:
         good = _as_json(names, chosen.first) if chosen.json else _as_table(names, chosen.first)
         return 0 if good and (not chosen.mutants or _mutants(names)) else 1

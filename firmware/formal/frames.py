@@ -7,7 +7,8 @@ r"""Only whole frames are accepted from the link: the deframer, for any bytes at
     bad      __________________/‾\    one clock for every delimiter that ends anything else
     memory   written only while no frame is kept in it
 
-That the CRC is zlib's and COBS the package's is simulated: `tests/firmware/test_gateware_link.py`.
+Simulations check that CRC and COBS agree with zlib and the package cobs:
+`tests/firmware/test_gateware_link.py`.
 """
 
 from __future__ import annotations

@@ -41,7 +41,8 @@ class Proof:
     cover_depth: int
     """Clocks from reset within which every cover is reached."""
     depth: int = 1
-    """Of the induction: clocks that must be good for the next to follow. Pipelines want their length."""
+    """Depth of the induction: the clocks in which all properties must hold for the next one. A pipeline needs
+    its length."""
 
 
 class Harness:
@@ -103,9 +104,9 @@ class Harness:
 
 
 def opened(component: Any, *kinds: type) -> tuple[Any, ...]:
-    """The elaborated module, and the local variables of its ``elaborate``, or its parts' of those ``kinds``.
+    """Return the elaborated module, and the locals of its ``elaborate``, or those of its parts of ``kinds``.
 
-    Induction has to speak of registers that no port shows; these are under the names of the source.
+    Induction has to refer to registers that no port shows; they have the names of the source.
     """
     wanted: tuple[Any, ...] = kinds or (type(component),)
     local: dict[object, dict[str, Any]] = {kind.elaborate.__code__: {} for kind in wanted}
@@ -123,9 +124,10 @@ def opened(component: Any, *kinds: type) -> tuple[Any, ...]:
 
 
 def times(value: Value, factor: Value, most: int) -> Value:
-    """``value · factor`` for a factor of 0 to ``most``.
+    """Return ``value · factor`` for a factor of 0 to ``most``.
 
-    By repeated addition: for a solver it is obvious that the next multiple is this one plus ``value``.
+    It is computed by repeated addition: to a solver it is obvious that the next multiple is this one plus
+    ``value``.
     """
     multiple: Value = Const(0, len(value) + most.bit_length())
     product = multiple

@@ -14,7 +14,7 @@ class Mutant:
     """Part of one line of ``file``, there exactly once."""
     new: str
     breaks: str
-    """A property; which others it breaks does not matter."""
+    """A property that the change breaks; it may break others as well."""
 
 
 MUTANTS = (

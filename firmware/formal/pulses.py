@@ -1,4 +1,4 @@
-r"""Every request is answered by exactly one camera pulse, at the distance from it that was set.
+r"""Every request is answered by exactly one camera pulse, with exactly the configured delay.
 
 ::
 
@@ -6,7 +6,7 @@ r"""Every request is answered by exactly one camera pulse, at the distance from 
     level   ____________/‾‾‾‾‾‾‾‾\___________________     delay + 2 clocks later, for width clocks
              |<-delay+2->|<-width>|
 
-Pulses are therefore exactly as far apart as the requests: no jitter comes in here, and with `settings`'
+Pulses are therefore exactly as far apart as the requests: no jitter is added here, and with `settings`'
 claim that the distance is at least CAMERA_MIN_PERIOD no two are closer than the camera can take.
 """
 

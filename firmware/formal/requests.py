@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterable
 
 CLOCKS = 8
-"""Of induction: from one write to the next takes fewer."""
+"""Depth of the induction: fewer clocks pass from one write to the next."""
 
 
 def requests_proof() -> Proof:
@@ -61,7 +61,7 @@ def requests_proof() -> Proof:
 
 
 def _heard(harness: Harness, host: Host, changes: Value) -> None:
-    """Requests that reset the watchdog: each one of good form, once; a silent host never does."""
+    """Claim that each well-formed request resets the watchdog once, and that a silent host never does."""
     m, claim = harness.m, harness.claim
     heard, asked = Signal(), Signal()
     with m.If(host.release):

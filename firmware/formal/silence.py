@@ -7,7 +7,7 @@ r"""A run whose host is silent for WATCHDOG clocks is over two lines later; with
     silent       1 2 3 .. 1 2 3 ... period ... <= period + BARK_CLOCKS + two lines
     led       =====light or not=====================\____      PIN_CLOCKS behind
 
-Part of the proof `runs`: here are the watchdog, the light and what is claimed of both.
+Part of the proof `runs`: the watchdog, the light, and the claims about both.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ SILENT_BITS = 33 + LINE_CLOCK_BITS
 def silence_and_dark(
     harness: Harness, commands: Commands, timing: Timing, seen: Observer, leaving: Signal
 ) -> list[Signal]:
-    """Makes the claims; returns the free inputs. ``leaving``: the last sub-step's light is over."""
+    """Make the claims; return the free inputs. ``leaving``: the last sub-step's light is over."""
     return [*_silence(harness, commands, timing, seen), *_dark(harness, timing, leaving)]
 
 

@@ -23,7 +23,7 @@ from firmware.top import Build
 
 FLAGS = slice(SEQUENCE_BITS + TAG_BITS - 16, SEQUENCE_BITS + TAG_BITS)
 SOON = 1
-"""Clocks with room and no line within which an event has its tag."""
+"""Clocks with room and no line within which an event must have its tag."""
 
 
 class Ledger:

@@ -15,7 +15,7 @@ from acquire.cli import main
 
 @dataclass(frozen=True)
 class Answer:
-    """What a command said."""
+    """Output and exit code of a command."""
 
     code: int
     out: str

@@ -1,4 +1,4 @@
-"""`acquire bench` on a load that every host holds."""
+"""`acquire bench` at a load that every host sustains."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from acquire.config import load_rig
 COMMAND = str(Path(sys.executable).with_name("acquire"))
 
 
-def test_bench_says_what_it_tried_and_leaves_nothing(tmp_path: Path) -> None:
+def test_bench_reports_its_trials_and_leaves_nothing_behind(tmp_path: Path) -> None:
     ended = subprocess.run(
         [COMMAND, "bench", "--out", str(tmp_path), "--seconds", "0.2", "--runs", "2", "--json"],
         capture_output=True, text=True, check=False, timeout=300,
@@ -28,7 +28,7 @@ def test_bench_says_what_it_tried_and_leaves_nothing(tmp_path: Path) -> None:
     assert not any(tmp_path.iterdir())
 
 
-def test_bench_refuses_what_makes_no_sense(tmp_path: Path) -> None:
+def test_bench_refuses_senseless_options(tmp_path: Path) -> None:
     ended = subprocess.run(
         [COMMAND, "bench", "--seconds", "0"], capture_output=True, text=True, check=False, timeout=300
     )

@@ -55,7 +55,7 @@ def test_step_by_step_to_a_page(cli: Cli, taken: dict[str, Path], tmp_path: Path
     assert answer.out.count("holds") == 4
 
 
-def test_a_check_that_fails_says_what_has_changed(cli: Cli, taken: dict[str, Path], tmp_path: Path) -> None:
+def test_a_failed_check_names_what_has_changed(cli: Cli, taken: dict[str, Path], tmp_path: Path) -> None:
     cal = tmp_path / "cal.zarr"
     assert cli("calibrate", "align", taken["target"], "--out", cal, "--json").code == 0
     moved = (*NOISE, OFF | {"rows": 3.0})
@@ -78,7 +78,7 @@ def test_a_check_that_fails_says_what_has_changed(cli: Cli, taken: dict[str, Pat
         (("dark", "dark", "--lines", 3), "too short"),
     ],
 )
-def test_what_cannot_be_is_refused_and_leaves_nothing(
+def test_impossible_requests_are_refused_and_leave_nothing_behind(
     cli: Cli, taken: dict[str, Path], tmp_path: Path, words: Any, said: str
 ) -> None:
     step, recording, *more = words
@@ -88,7 +88,7 @@ def test_what_cannot_be_is_refused_and_leaves_nothing(
     assert list(tmp_path.iterdir()) == []
 
 
-def test_an_orientation_that_cannot_be_told_is_not_kept(cli: Cli, tmp_path: Path) -> None:
+def test_an_undetermined_orientation_is_not_saved(cli: Cli, tmp_path: Path) -> None:
     plain = record(tmp_path / "plain.zarr", white(0.4, NOISE), "target", 256)
     answer = cli("calibrate", "orientation", plain, "--out", tmp_path / "cal.zarr")
     assert answer.code == 2
@@ -96,7 +96,9 @@ def test_an_orientation_that_cannot_be_told_is_not_kept(cli: Cli, tmp_path: Path
     assert not (tmp_path / "cal.zarr").exists()
 
 
-def test_a_recording_carries_what_its_rig_names(cli: Cli, taken: dict[str, Path], tmp_path: Path) -> None:
+def test_a_recording_carries_the_calibration_of_its_rig(
+    cli: Cli, taken: dict[str, Path], tmp_path: Path
+) -> None:
     cal = tmp_path / "cal.zarr"
     for step, recording in (("dark", "dark"), ("flat", "flat"), ("align", "target")):
         assert cli("calibrate", step, taken[recording], "--out", cal, "--json").code == 0
@@ -122,15 +124,15 @@ def test_a_recording_carries_what_its_rig_names(cli: Cli, taken: dict[str, Path]
     assert "arm B lies" in cli("calibrate", "show", carrying).out
 
 
-def test_what_each_part_gives_is_told(cli: Cli, taken: dict[str, Path], tmp_path: Path) -> None:
-    """The target itself, at rest: without arm B in its place its samples are predicted worse."""
+def test_the_effect_of_each_part_is_reported(cli: Cli, taken: dict[str, Path], tmp_path: Path) -> None:
+    """The target itself, at rest: without the alignment of arm B its samples are predicted less well."""
     cal = tmp_path / "cal.zarr"
     for step, recording in (("dark", "dark"), ("flat", "flat"), ("align", "target")):
         assert cli("calibrate", step, taken[recording], "--out", cal, "--json").code == 0
     words = ("--calibration", cal, "--lines", 120, "--nm", 1, "--tm", 431)
-    told = cli("reconstruct", taken["target"], "--explain", *words, "--json")
-    assert told.code == 0, told.err
-    parts = {part["part"]: part for part in told.json["parts"]}
+    explained = cli("reconstruct", taken["target"], "--explain", *words, "--json")
+    assert explained.code == 0, explained.err
+    parts = {part["part"]: part for part in explained.json["parts"]}
     assert list(parts)[:2] == ["nothing", "all of it"]
     assert parts["all of it"]["prediction"] < parts["nothing"]["prediction"]
     assert parts["arm B laid on arm A"]["gain_db"] > 1

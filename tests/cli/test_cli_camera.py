@@ -34,7 +34,7 @@ def test_devices_of_a_rig_are_listed_with_their_serial_numbers(cli: Cli, rig: st
     ]
 
 
-def test_what_a_rig_lacks_is_said(cli: Cli, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_missing_parts_of_a_rig_are_reported(cli: Cli, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("GENICAM_GENTL64_PATH", raising=False)
     answer = cli("devices", "--config", "rig-vt-4k5c-h100")
     assert answer.code == 0
@@ -49,7 +49,7 @@ def of_host(producers: str) -> list[dict[str, str]]:
     return json.loads(done.stdout)
 
 
-def test_without_a_rig_every_way_to_a_device_says_what_it_shows() -> None:
+def test_without_a_rig_every_transport_lists_its_devices() -> None:
     rows = {row["device"]: row["state"] for row in of_host("")}
     assert list(rows) == ["trigger, serial", "trigger, USB", "camera, GenTL", "camera, Aravis"]
     assert "try: cti in the camera's table, or GENICAM_GENTL64_PATH" in rows["camera, GenTL"]
@@ -64,7 +64,7 @@ def test_cameras_of_the_environment_s_producers_are_listed() -> None:
 
 
 @pytest.mark.needs_compiler
-def test_features_show_value_and_what_is_possible(cli: Cli) -> None:
+def test_features_show_their_value_and_possible_values(cli: Cli) -> None:
     rows = cli("camera", "features", "SIM-A", "--config", "rig-demo-gentl", "--json").json
     by_name = {(row["module"], row["feature"]): row for row in rows}
     assert by_name["remote", "PixelFormat"]["value"] == "Mono12p"
@@ -94,7 +94,7 @@ def test_a_picture_is_stretched(cli: Cli, tmp_path: Path) -> None:
         assert (picture.size, picture.getextrema()) == ((64, 200), (0, 255))
 
 
-def test_wrong_words_touch_nothing(cli: Cli, tmp_path: Path) -> None:
+def test_wrong_arguments_change_nothing(cli: Cli, tmp_path: Path) -> None:
     taken = tmp_path / "a.png"
     taken.touch()
     for words, text in (

@@ -59,7 +59,7 @@ def test_one_camera_until_ctrl_c() -> None:
     assert not psutil.wait_procs(children, timeout=60)[1]
 
 
-def test_wrong_words(cli: Cli, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_wrong_arguments(cli: Cli, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("GENICAM_GENTL64_PATH", raising=False)
     nobody = ("--socket", tmp_path / "none.sock")
     for command, code, text in (
@@ -72,7 +72,7 @@ def test_wrong_words(cli: Cli, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
         assert (answer.code, text in answer.err) == (code, True), answer.err
 
 
-def test_the_screen_says_what_is_wrong() -> None:
+def test_the_screen_names_the_problem() -> None:
     screen = Screen({"a": "A\x1b[2J", "b": "B"}, "here", 0.2)
     screen.show({"a": Reading(100, 0, 0.5, 1.0, 0.01, 0.2), "b": Reading(0)})
     shown = _drawn(screen)

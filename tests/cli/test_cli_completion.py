@@ -1,4 +1,4 @@
-"""Tab: what bash, zsh and fish are offered, as their scripts ask for it; in bash itself, too."""
+"""Completions offered to bash, zsh and fish, requested as their scripts do, and in bash itself."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ def test_commands_options_and_values(offered: Callable[..., list[str]], shell: s
 
 
 @pytest.mark.parametrize("shell", SHELLS)
-def test_recordings_and_directories_but_no_name_that_a_shell_would_take_apart(
+def test_recordings_and_directories_without_names_that_a_shell_would_split(
     offered: Callable[..., list[str]], shell: str, tmp_path: Path
 ) -> None:
     assert offered("acquire info ", shell) == ["old/", "take.zarr"]
@@ -71,7 +71,7 @@ def test_the_states_are_the_daemon_s() -> None:
 
 
 def test_bash_itself_completes(tmp_path: Path) -> None:
-    """The script that is printed, in the shell that it is for."""
+    """The printed script works in its shell."""
     script = (
         'eval "$(acquire completion bash)"\n'
         "COMP_WORDS=(acquire status --wait dr); COMP_CWORD=3\n"
@@ -95,7 +95,7 @@ def test_fish_itself_completes(tmp_path: Path) -> None:
 
 @pytest.mark.needs_zsh
 def test_zsh_itself_completes(tmp_path: Path) -> None:
-    """What the function hands to zsh's own _arguments, which works inside the line editor only."""
+    """The function's arguments for zsh's own _arguments, which works only inside the line editor."""
     script = (
         "autoload -U compinit; compinit -u -D\n"
         'eval "$(acquire completion zsh)"; print -r -- ${_comps[acquire]}\n'
@@ -106,7 +106,7 @@ def test_zsh_itself_completes(tmp_path: Path) -> None:
 
 
 def shell(place: Path, name: str, script: str, *options: str) -> list[str]:
-    """Lines that a script prints in a shell, where `acquire` is this program."""
+    """Return the lines that a script prints in a shell, where `acquire` is this program."""
     found = shutil.which(name)
     assert found is not None
     program = place / "acquire"

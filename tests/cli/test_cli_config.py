@@ -1,4 +1,4 @@
-"""``acquire config``: what it says of good files, and of bad ones."""
+"""``acquire config``: its answers for good files and for bad ones."""
 
 from __future__ import annotations
 
@@ -99,7 +99,9 @@ def test_bad_files_name_the_key(cli: Cli, rig_file: Path, before: str, after: st
         ),
     ],
 )
-def test_what_no_trigger_can_honour_is_refused(cli: Cli, rig_file: Path, line: str, words: str) -> None:
+def test_settings_that_no_trigger_supports_are_refused(
+    cli: Cli, rig_file: Path, line: str, words: str
+) -> None:
     text = rig_file.read_text(encoding="utf-8")
     keys = [new.partition(" =")[0] for new in line.splitlines()]
     kept = "\n".join(old for old in text.splitlines() if old.partition(" =")[0] not in keys)
@@ -124,7 +126,7 @@ def test_bad_scene_is_found_by_check(cli: Cli, rig_file: Path) -> None:
     assert "leds.0.size" in answer.err
 
 
-def test_show_is_a_file_that_means_the_same(cli: Cli, rig_file: Path, tmp_path: Path) -> None:
+def test_show_prints_an_equivalent_file(cli: Cli, rig_file: Path, tmp_path: Path) -> None:
     shown = tmp_path / "shown.toml"
     shown.write_text(cli("config", "show", rig_file).out)
     assert load_rig(shown) == load_rig(rig_file)
@@ -145,7 +147,7 @@ def test_code_without_a_kind_is_pseudo_random(rig_file: Path) -> None:
     assert load_rig(rig_file).code == expected
 
 
-def test_directory_of_recordings_must_be_there(cli: Cli, rig_file: Path) -> None:
+def test_the_directory_of_recordings_must_exist(cli: Cli, rig_file: Path) -> None:
     rig_file.write_text(rig_file.read_text().replace("[recording]", '[recording]\ndirectory = "/nowhere"'))
     answer = cli("config", "check", rig_file)
     assert answer.code == 2

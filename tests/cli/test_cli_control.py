@@ -1,4 +1,4 @@
-"""The control commands' words, over a client that the test scripts."""
+"""The output of the control commands, over a scripted client."""
 
 from __future__ import annotations
 
@@ -120,7 +120,7 @@ def test_status_as_json_is_the_message(cli: Cli, answering: Callable[[Status], F
     assert "camera a is gone" in cli("status").out
 
 
-def test_start_passes_everything_on(cli: Cli, answering: Callable[[Status], FakeClient]) -> None:
+def test_start_passes_on_all_its_options(cli: Cli, answering: Callable[[Status], FakeClient]) -> None:
     client = answering(status(State.RECORDING))
     assert cli("start", "x.zarr", "--lines", 5).code == 0
     assert cli("start", "--duration", 0.5).code == 0
@@ -135,7 +135,7 @@ def test_start_passes_everything_on(cli: Cli, answering: Callable[[Status], Fake
     ]
 
 
-def test_wait_passes_state_and_time_on(cli: Cli, answering: Callable[[Status], FakeClient]) -> None:
+def test_wait_passes_on_state_and_time(cli: Cli, answering: Callable[[Status], FakeClient]) -> None:
     client = answering(status(State.IDLE))
     assert cli("status", "--wait", "idle", "--timeout", 300).code == 0
     assert client.calls == [("wait", {State.IDLE}, 300.0, {})]
@@ -144,7 +144,7 @@ def test_wait_passes_state_and_time_on(cli: Cli, answering: Callable[[Status], F
 @pytest.mark.parametrize(
     ("condition", "code"), [("GOOD", 0), ("TAINTED", 0), ("INCOMPLETE", 6), ("ABORTED", 6), (None, 6)]
 )
-def test_stop_tells_of_lost_lines(
+def test_stop_reports_lost_lines(
     cli: Cli, answering: Callable[[Status], FakeClient], condition: str | None, code: int
 ) -> None:
     answering(status(State.IDLE, last=last(condition)))
@@ -163,14 +163,14 @@ def test_durations_in_words(text: str, value: float) -> None:
 
 
 @pytest.mark.parametrize("text", ["", "s", "2 weeks", "-1s", "1s2", "nan", "inf", "1..2s"])
-def test_what_is_no_duration_is_refused(cli: Cli, text: str) -> None:
+def test_an_invalid_duration_is_refused(cli: Cli, text: str) -> None:
     answer = cli("start", f"--pre={text}")
     assert answer.code == 2
     assert "is not a duration, such as 2s, 500ms" in " ".join(answer.err.split())
 
 
 class Terminal(io.StringIO):
-    """stdout of a person."""
+    """A standard output that is a terminal."""
 
     def isatty(self) -> bool:
         return True
@@ -215,7 +215,7 @@ def test_status_fits_the_terminal(
 
 
 class PassingClient:
-    """Answers, is away, answers; then Ctrl-C is pressed."""
+    """Client that answers, is absent, and answers again; then Ctrl-C is pressed."""
 
     def __init__(self, _: object) -> None:
         self.answers = [status(State.ARMED), status(State.ARMED), None, status(State.RECORDING)]
@@ -229,14 +229,14 @@ class PassingClient:
         return answer
 
 
-def test_status_is_watched_until_ctrl_c_and_a_daemon_that_goes_is_missed(
+def test_watching_the_status_lasts_until_ctrl_c_and_reports_a_daemon_that_ended(
     cli: Cli, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("acquire.cli.watch.Client", PassingClient)
     answer = cli("status", "--watch", "--every", "0.1")
     assert answer.code == EXIT_INTERRUPTED
-    told = [line.partition(" ")[2] for line in answer.out.splitlines()]
-    assert [line.partition(",")[0] for line in told] == ["armed", "armed", "no daemon listens", "recording"]
+    states = [line.partition(" ")[2] for line in answer.out.splitlines()]
+    assert [line.partition(",")[0] for line in states] == ["armed", "armed", "no daemon listens", "recording"]
     lines = cli("status", "--watch", "--every", "100ms", "--json").out.splitlines()
     assert [json.loads(line).get("state") for line in lines] == ["armed", "armed", None, "recording"]
     assert json.loads(lines[2])["error"]["error"] == "NoDaemonError"

@@ -1,4 +1,4 @@
-"""``acquire demo``: what cannot be carried out to the end is refused before anything is touched."""
+"""``acquire demo``: requests that cannot be completed are refused before anything is touched."""
 
 from __future__ import annotations
 
@@ -52,13 +52,13 @@ def test_rigs_that_show_too_little(cli: Cli, tmp_path: Path, before: str, after:
     assert not (tmp_path / "new").exists()
 
 
-def test_no_directory_to_make_one_in(cli: Cli, tmp_path: Path) -> None:
+def test_the_parent_directory_must_exist(cli: Cli, tmp_path: Path) -> None:
     answer = cli("demo", "--out", tmp_path / "none" / "new")
     assert answer.code == 2
     assert f"no directory {tmp_path / 'none'}" in answer.err
 
 
-def test_the_report_tells_the_command_that_does_the_same() -> None:
+def test_the_report_contains_the_equivalent_command() -> None:
     plain = DemoPlan(Path("out"))
     assert plain.command == "acquire demo --seed 1 --lines 33334"
     other = DemoPlan(Path("out"), "my rig.toml", 3, 5000, 2.0, 1.5)

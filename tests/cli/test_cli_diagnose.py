@@ -18,12 +18,12 @@ Cli = Callable[..., Any]
 
 @pytest.fixture(scope="module")
 def late(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Its light is two sub-steps late."""
+    """A recording whose light is two sub-steps late."""
     late = CodeErrors(kind="code_errors", late_substeps=2)
     return record_two_squares(tmp_path_factory.mktemp("late") / "run.zarr", 150, [late])
 
 
-def test_what_is_wrong_is_said_with_its_evidence(cli: Cli, late: Path) -> None:
+def test_a_wrong_description_is_reported_with_its_evidence(cli: Cli, late: Path) -> None:
     answer = cli("diagnose", late)
     assert answer.code == 1, answer.err
     assert "named: the lines are 2 sub-steps late against the code" in answer.out
@@ -40,7 +40,7 @@ def test_the_same_for_programs(cli: Cli, late: Path) -> None:
     assert best["log_likelihood"] > 0
 
 
-def test_lines_that_are_not_there(cli: Cli, late: Path) -> None:
+def test_missing_lines(cli: Cli, late: Path) -> None:
     answer = cli("diagnose", late, "--first-line", 100_000_000)
     assert answer.code == 2
     assert "not there" in answer.err
@@ -48,12 +48,12 @@ def test_lines_that_are_not_there(cli: Cli, late: Path) -> None:
 
 @pytest.fixture(scope="module")
 def mirrored(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Its arm B is mirrored; the scene is a pulsing square and a steady one."""
+    """A recording whose arm B is mirrored; the scene is a pulsing square and a steady one."""
     b = ArmOptics(turn_deg=270, mirror=True)
     return record_two_squares(tmp_path_factory.mktemp("mirrored") / "run.zarr", 150, b=b)
 
 
-def test_a_mirrored_arm_is_named_by_reconstruct_and_put_right_on_request(
+def test_reconstruct_reports_a_mirrored_arm_and_corrects_it_on_request(
     cli: Cli, mirrored: Path, tmp_path: Path
 ) -> None:
     words = ("--nm", 2, "--iterations", 12, "--workers", 1)

@@ -79,7 +79,7 @@ def test_the_whole_scene_becomes_one_video_whatever_the_order_of_the_bands(
     assert answer.code == 0, answer.err
 
 
-def test_a_part_and_a_preview(cli: Cli, recording: Path, tmp_path: Path) -> None:
+def test_some_of_the_tiles_and_a_preview(cli: Cli, recording: Path, tmp_path: Path) -> None:
     words = ("--tiles", "0-1,1", "--nm", 4, "--tm", 10, "--iterations", 5, "--workers", 1, "--json")
     answer = cli("reconstruct", recording, "--out", tmp_path / "part.zarr", *words)
     assert answer.code == 0, answer.err
@@ -104,7 +104,7 @@ def test_a_part_and_a_preview(cli: Cli, recording: Path, tmp_path: Path) -> None
         (("--search", "none"), "there is no --search none possible: each, shared"),
     ],
 )
-def test_what_cannot_be_is_refused_before_anything_is_made(
+def test_impossible_requests_are_refused_before_anything_is_created(
     cli: Cli, recording: Path, tmp_path: Path, words: tuple[object, ...], reason: str
 ) -> None:
     answer = cli("reconstruct", recording, "--out", tmp_path / "v.zarr", *words)
@@ -112,7 +112,7 @@ def test_what_cannot_be_is_refused_before_anything_is_made(
     assert not (tmp_path / "v.zarr").exists()
 
 
-def test_one_tile_speaks_where_a_look_at_one_is_enough(cli: Cli, recording: Path, tmp_path: Path) -> None:
+def test_one_tile_is_diagnosed_and_used_for_the_plan(cli: Cli, recording: Path, tmp_path: Path) -> None:
     answer = cli("diagnose", recording, "--json")
     assert answer.code == 0, answer.err
     assert answer.json["standing"] == "right"
@@ -126,7 +126,7 @@ def test_one_tile_speaks_where_a_look_at_one_is_enough(cli: Cli, recording: Path
     assert 'why = "tile ' in (tmp_path / "plan.toml").read_text()
 
 
-def test_a_tile_is_measured_against_what_it_shows(cli: Cli, recording: Path, tmp_path: Path) -> None:
+def test_tradeoff_compares_a_tile_with_its_truth(cli: Cli, recording: Path, tmp_path: Path) -> None:
     words = ("--preset", "fast", "--solver", "admm", "--repeats", 1, "--lines", 60, "--voxels", "2x75")
     words += ("--no-learn", "--json", "--tile", "0,1")
     answer = cli("tradeoff", recording, "--out", tmp_path / "page", *words)

@@ -1,4 +1,4 @@
-"""Help and status come at once; the table of commands is what the modules register."""
+"""Help and status appear at once; the table of commands is what the modules register."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ def test_the_overview_fits_the_terminal(cli: Cli, monkeypatch: pytest.MonkeyPatc
         assert re.search(rf"^  {command.name} ", said, re.MULTILINE)
 
 
-def test_no_words_are_answered_with_the_overview_and_exit_2(cli: Cli) -> None:
+def test_without_arguments_the_overview_is_shown_with_exit_code_2(cli: Cli) -> None:
     answer = cli()
     assert (answer.code, answer.out) == (2, "")
     assert "Begin here:" in answer.err
@@ -77,13 +77,13 @@ def test_no_words_are_answered_with_the_overview_and_exit_2(cli: Cli) -> None:
         (("status", "--wait", "armd"), "no state 'armd'; did you mean 'armed'?"),
     ],
 )
-def test_what_was_probably_meant_is_named(cli: Cli, words: tuple[str, ...], meant: str) -> None:
+def test_a_typo_gets_a_suggestion(cli: Cli, words: tuple[str, ...], meant: str) -> None:
     answer = cli(*words)
     assert answer.code == 2
     assert meant in answer.err
 
 
-def test_what_is_like_nothing_is_told_without_a_guess(cli: Cli) -> None:
+def test_an_unrecognisable_word_gets_no_suggestion(cli: Cli) -> None:
     assert "did you mean" not in cli("xyzzy").err
 
 
@@ -95,7 +95,7 @@ def test_help_names_the_environment_s_variables(cli: Cli) -> None:
     "words", [["ls", "."], ["info", "run.zarr"], ["info", "run.zarr", "--json"]], ids=" ".join
 )
 @pytest.mark.parametrize("state", ["sealed", "growing", "among odd entries"])
-def test_recordings_are_listed_without_libraries_of_arrays(
+def test_recordings_are_listed_without_array_libraries(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, words: list[str], state: str
 ) -> None:
     """Metadata and small tables need the standard library alone; the others take longer than the answer."""
@@ -122,8 +122,8 @@ def test_recordings_are_listed_without_libraries_of_arrays(
     )
     assert "run.zarr" in ended.stdout
     if state == "among odd entries" and words[0] == "ls":
-        told = {line.split()[0]: line for line in ended.stdout.splitlines()[1:-1]}
-        assert set(told) == {"empty.zarr", "link.zarr", "run.zarr", "torn.zarr"}
-        assert "is not a recording: it holds no zarr.json" in told["empty.zarr"]
-        assert "zarr.json is damaged" in told["torn.zarr"]
+        listed = {line.split()[0]: line for line in ended.stdout.splitlines()[1:-1]}
+        assert set(listed) == {"empty.zarr", "link.zarr", "run.zarr", "torn.zarr"}
+        assert "is not a recording: it holds no zarr.json" in listed["empty.zarr"]
+        assert "zarr.json is damaged" in listed["torn.zarr"]
     assert ended.stdout.splitlines()[-1] == "loaded: []"

@@ -1,4 +1,4 @@
-"""Recordings whose root says what cannot be: every command ends with a sentence and 6, not with a traceback.
+"""Recordings with impossible attributes: every command ends with a sentence and exit code 6, not a traceback.
 
 One recording, changed in one place at a time: whatever a crafted or a torn root claims, nobody counts to it,
 allocates it, follows it out of the directory, or repeats it as if it were true.
@@ -62,7 +62,7 @@ def node(path: str, value: object) -> Change:
 
 
 def length(rows: int) -> Change:
-    """All arrays claim so many rows."""
+    """Let all arrays claim this number of rows."""
 
     def change(document: dict[str, Any]) -> None:
         for path, metadata in document["consolidated_metadata"]["metadata"].items():
@@ -208,8 +208,8 @@ def commands(path: Path, out: Path) -> dict[str, tuple[object, ...]]:
 
 
 @pytest.mark.parametrize("name", MUTANTS)
-def test_what_cannot_be_is_refused_when_it_is_opened(name: str, templates: dict[str, Path]) -> None:
-    """All commands begin with that."""
+def test_impossible_attributes_are_refused_on_opening(name: str, templates: dict[str, Path]) -> None:
+    """All commands begin by opening the recording."""
     document = json.loads((templates["open"] / "zarr.json").read_bytes())
     MUTANTS[name](document)
 
@@ -225,7 +225,9 @@ def test_what_cannot_be_is_refused_when_it_is_opened(name: str, templates: dict[
     "name",
     ["lines 1e+18", "ledger 5", "segments [1]", "holds 'junk'", "gaps None"],
 )
-def test_every_command_says_so(name: str, templates: dict[str, Path], tmp_path: Path, cli: Any) -> None:
+def test_every_command_reports_the_damage(
+    name: str, templates: dict[str, Path], tmp_path: Path, cli: Any
+) -> None:
     path, out = tmp_path / "in" / "x.zarr", tmp_path / "out"
     out.mkdir()
     shutil.copytree(templates["open"], path)
@@ -242,7 +244,7 @@ def test_every_command_says_so(name: str, templates: dict[str, Path], tmp_path: 
 
 
 @pytest.mark.parametrize("name", TABLES)
-def test_what_cannot_be_beside_the_lines_is_told_by_verify(
+def test_verify_reports_attributes_that_contradict_the_lines(
     name: str, templates: dict[str, Path], tmp_path: Path
 ) -> None:
     path = tmp_path / "x.zarr"
@@ -256,7 +258,7 @@ def test_what_cannot_be_beside_the_lines_is_told_by_verify(
 def test_an_endless_recording_may_have_dropped_any_number_of_lines(
     templates: dict[str, Path], tmp_path: Path, cli: Any
 ) -> None:
-    """Nobody goes through them one by one."""
+    """The dropped lines are not counted one by one."""
     path = tmp_path / "x.zarr"
     shutil.copytree(templates["open"], path)
     document = json.loads((path / "zarr.json").read_bytes())
@@ -266,8 +268,8 @@ def test_an_endless_recording_may_have_dropped_any_number_of_lines(
         assert cli(*commands(path, tmp_path)[command]).code == 0
 
 
-def test_the_templates_are_no_mutants(templates: dict[str, Path], tmp_path: Path, cli: Any) -> None:
-    """What the mutants are compared with is taken by every command."""
+def test_the_templates_are_valid(templates: dict[str, Path], tmp_path: Path, cli: Any) -> None:
+    """Every command accepts the recordings from which the mutants are made."""
     path = tmp_path / "x.zarr"
     shutil.copytree(templates["open"], path)
     for command, words in commands(path, tmp_path).items():
@@ -275,7 +277,7 @@ def test_the_templates_are_no_mutants(templates: dict[str, Path], tmp_path: Path
             assert cli(*words).code == 0, command
 
 
-def test_a_name_that_is_no_number_is_no_shard(templates: dict[str, Path], tmp_path: Path, cli: Any) -> None:
+def test_a_file_without_a_number_is_not_a_shard(templates: dict[str, Path], tmp_path: Path, cli: Any) -> None:
     path = tmp_path / "x.zarr"
     shutil.copytree(templates["open"], path)
     for name in ("²", "-1", "007", "9" * 30, "x"):
@@ -286,7 +288,7 @@ def test_a_name_that_is_no_number_is_no_shard(templates: dict[str, Path], tmp_pa
     assert (path / "a" / "lines" / "c" / "²").is_dir()
 
 
-def test_what_is_cut_short_or_not_there_is_no_good_recording(
+def test_truncated_or_missing_parts_make_a_recording_damaged(
     templates: dict[str, Path], tmp_path: Path, cli: Any
 ) -> None:
     short, alone = tmp_path / "short.zarr", tmp_path / "alone.zarr"
@@ -301,9 +303,9 @@ def test_what_is_cut_short_or_not_there_is_no_good_recording(
     rows = {row.split()[0]: row for row in cli("ls", tmp_path).out.splitlines()}
     assert {name for name, row in rows.items() if "DAMAGED" in row} == {"short.zarr", "alone.zarr"}
     assert "GOOD" in rows["whole.zarr"]
-    told = cli("verify", alone)
-    assert told.code == 6
-    assert "its segment alone-2.zarr is listed and cannot be read" in told.out
+    verified = cli("verify", alone)
+    assert verified.code == 6
+    assert "its segment alone-2.zarr is listed and cannot be read" in verified.out
     assert "lines 116 to 163: the file is gone or cut short" in cli("info", short).out
     refused = cli("upload", short, f"file://{tmp_path}/far.zarr")
     assert (refused.code, "is not copied: a/lines" in refused.err) == (6, True)

@@ -1,4 +1,4 @@
-"""Exit code 6 says that data is lost or damaged and nothing else: not that a path or URL holds none."""
+"""Exit code 6 means that data is lost or damaged, never that a path or URL holds none."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ NO_FILES = ("absent", "below a file", "file", "too long")
 
 @pytest.fixture
 def places(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> dict[str, str]:
-    """Paths that hold no recording, by what they are."""
+    """Paths without a recording, by kind."""
     monkeypatch.chdir(tmp_path)
     there = tmp_path / "there"
     (there / "directory").mkdir(parents=True)
@@ -74,13 +74,13 @@ def places(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> dict[str, str]:
 
 
 def untouched(directory: Path) -> bool:
-    """Nothing new was made."""
+    """Return whether nothing was created."""
     return {path.name for path in directory.iterdir()} <= {"there"}
 
 
 @pytest.mark.parametrize("what", NO_RECORDINGS)
 @pytest.mark.parametrize("words", [*READERS.values(), *CHANGERS.values()], ids=[*READERS, *CHANGERS])
-def test_what_is_no_recording_is_a_wrong_path_and_no_damage(
+def test_a_path_that_is_not_a_recording_is_a_wrong_path_not_damage(
     cli: Cli, tmp_path: Path, places: dict[str, str], words: tuple[str, ...], what: str
 ) -> None:
     answer = cli(*(word.format(place=places[what]) for word in words))
@@ -93,7 +93,7 @@ def test_what_is_no_recording_is_a_wrong_path_and_no_damage(
 
 @pytest.mark.parametrize("what", NO_FILES)
 @pytest.mark.parametrize("words", FILES.values(), ids=FILES)
-def test_what_is_no_such_file_is_a_wrong_path(
+def test_a_path_without_the_expected_file_is_a_wrong_path(
     cli: Cli, tmp_path: Path, places: dict[str, str], words: tuple[str, ...], what: str
 ) -> None:
     answer = cli(*(word.format(place=places[what]) for word in words))
@@ -104,7 +104,7 @@ def test_what_is_no_such_file_is_a_wrong_path(
 
 @pytest.mark.needs_user
 @pytest.mark.parametrize("words", [*READERS.values(), *CHANGERS.values()], ids=[*READERS, *CHANGERS])
-def test_what_this_user_may_not_read_is_told_so(
+def test_unreadable_files_are_reported_as_such(
     cli: Cli, places: dict[str, str], words: tuple[str, ...]
 ) -> None:
     closed = Path(places["group"])
@@ -116,7 +116,7 @@ def test_what_this_user_may_not_read_is_told_so(
     assert (answer.code, "Permission denied" in answer.err) == (2, True)
 
 
-def test_a_video_is_told_from_a_recording(cli: Cli, tmp_path: Path) -> None:
+def test_a_video_is_distinguished_from_a_recording(cli: Cli, tmp_path: Path) -> None:
     times = np.arange(2, dtype=np.int64)
     write_video(tmp_path / "v.zarr", np.zeros((2, 4, 4), np.float32), times, 1.0, 1e4, {})
     answer = cli("info", tmp_path / "v.zarr")
@@ -126,7 +126,7 @@ def test_a_video_is_told_from_a_recording(cli: Cli, tmp_path: Path) -> None:
 
 @pytest.fixture(scope="module")
 def server() -> Iterator[S3Server]:
-    """One for all tests here. A client keeps its event loop for the life of the process: it is made now."""
+    """One server for all tests here, since a client keeps its event loop for the life of the process."""
     made = S3Server()
     made.start()
     with pytest.MonkeyPatch.context() as patch:
@@ -148,7 +148,7 @@ def closed_port() -> int:
 
 @pytest.mark.parametrize("family", sorted(WAYS_IN))
 @pytest.mark.parametrize("words", READERS.values(), ids=READERS)
-def test_a_store_without_credentials_is_refused_without_asking_anybody(
+def test_a_store_without_credentials_is_refused_without_a_request(
     cli: Cli, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, words: tuple[str, ...], family: str
 ) -> None:
     monkeypatch.chdir(tmp_path)
@@ -167,7 +167,7 @@ def test_a_store_without_credentials_is_refused_without_asking_anybody(
 
 
 @pytest.mark.parametrize("words", READERS.values(), ids=READERS)
-def test_a_bucket_or_a_name_that_is_not_there_is_a_wrong_url(
+def test_a_missing_bucket_or_name_is_a_wrong_url(
     cli: Cli,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
@@ -183,10 +183,8 @@ def test_a_bucket_or_a_name_that_is_not_there_is_a_wrong_url(
     assert untouched(tmp_path)
 
 
-def test_what_an_upload_meets(
-    cli: Cli, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, server: S3Server
-) -> None:
-    """No rights and no bucket are the user's matter, a network that is away the host's: nothing is lost."""
+def test_upload_errors(cli: Cli, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, server: S3Server) -> None:
+    """Missing rights or buckets are user errors, a missing network is the host's; nothing is lost."""
     from test_cli_recordings import write
 
     recording = write(tmp_path / "one.zarr")
@@ -229,7 +227,7 @@ def test_a_command_that_changes_a_recording_in_place_takes_no_url(cli: Cli, word
         ("info", "elsewhere", "elsewhere"),
     ],
 )
-def test_a_package_that_is_not_installed_is_named_with_the_extra_that_brings_it(
+def test_a_missing_package_is_named_with_the_extra_that_installs_it(
     monkeypatch: pytest.MonkeyPatch, command: str, module: str, brought: str
 ) -> None:
     monkeypatch.setattr("sys.argv", ["acquire", command, "run.zarr"])

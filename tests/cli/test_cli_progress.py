@@ -1,4 +1,4 @@
-"""How far long work is, and that Ctrl-C is answered: on a terminal, in a pipe, as JSON."""
+"""Progress of long work, and the answer to Ctrl-C: on a terminal, in a pipe, as JSON."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ LIMIT_S = 30.0
 
 @pytest.fixture
 def heard(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Callable[[int], list[str]]:
-    """Waits for so many more lines on stderr; lines come as fast as they can."""
+    """Wait for this number of further lines on stderr."""
     monkeypatch.setattr(module, "FIRST_S", 0.0)
     monkeypatch.setattr(module, "EVERY_S", 0.01)
 
@@ -52,7 +52,7 @@ def test_a_pipe_gets_lines_with_share_and_time_left(heard: Callable[[int], list[
     assert not [thread for thread in threading.enumerate() if thread.name == "acquire-progress"]
 
 
-def test_work_of_a_moment_says_nothing(capsys: pytest.CaptureFixture[str]) -> None:
+def test_short_work_shows_no_progress(capsys: pytest.CaptureFixture[str]) -> None:
     with Progress("looking") as progress:
         progress.advance(1, 2)
     assert capsys.readouterr().err == ""
@@ -76,7 +76,7 @@ def test_work_within_work_is_shown_in_its_place(heard: Callable[[int], list[str]
         assert heard(3)[-1].startswith("acquire: the demo, ")
 
 
-def test_what_will_take_long_says_so_once_with_what_is_quicker(capsys: pytest.CaptureFixture[str]) -> None:
+def test_long_work_is_announced_once_with_a_faster_alternative(capsys: pytest.CaptureFixture[str]) -> None:
     with Progress("reconstructing", "--preview") as progress:
         progress._began_s -= 100  # of compiling, which comes once
         progress.advance(1, 1000)
@@ -91,7 +91,7 @@ def test_what_will_take_long_says_so_once_with_what_is_quicker(capsys: pytest.Ca
 @pytest.mark.parametrize(
     ("seconds", "words"), [(0.4, "0 s"), (59, "59 s"), (61, "1 min 1 s"), (7320, "2 h 2 min")]
 )
-def test_durations_are_told_in_words(seconds: float, words: str) -> None:
+def test_durations_are_shown_in_words(seconds: float, words: str) -> None:
     assert span(seconds) == words
 
 

@@ -172,14 +172,16 @@ def test_a_video_is_written_to_a_url_and_rendered_from_it(cli: Cli, recording: P
         (("--device", "tpu"), "cpu, gpu"),
     ],
 )
-def test_what_cannot_be_is_refused(cli: Cli, recording: Path, tmp_path: Path, words: Any, said: str) -> None:
+def test_impossible_requests_are_refused(
+    cli: Cli, recording: Path, tmp_path: Path, words: Any, said: str
+) -> None:
     answer = cli("reconstruct", recording, "--out", tmp_path / "v.zarr", *words)
     assert answer.code == 2
     assert said in answer.err.lower() or said in answer.err
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_budget_takes_what_was_learned(
+def test_a_budget_uses_the_learned_presets(
     cli: Cli, recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
@@ -260,7 +262,7 @@ def cluster(tmp_path: Path) -> Iterator[str]:
 
 
 @pytest.mark.needs_dask
-def test_no_cluster_where_one_was_named(recording: Path, tmp_path: Path) -> None:
+def test_an_unreachable_cluster(recording: Path, tmp_path: Path) -> None:
     words = ["reconstruct", str(recording), "--out", str(tmp_path / "v.zarr"), "--dask", "tcp://127.0.0.1:9"]
     ended = subprocess.run(
         [sys.executable, "-m", "acquire", *words], capture_output=True, text=True, timeout=300, check=False
@@ -270,7 +272,9 @@ def test_no_cluster_where_one_was_named(recording: Path, tmp_path: Path) -> None
 
 
 @pytest.mark.needs_dask
-def test_a_cluster_gives_what_this_machine_gives(cluster: str, recording: Path, tmp_path: Path) -> None:
+def test_a_cluster_gives_the_same_result_as_this_machine(
+    cluster: str, recording: Path, tmp_path: Path
+) -> None:
     common = [
         sys.executable,
         "-m",

@@ -165,7 +165,7 @@ def test_cut_leaves_files_that_are_not_its_own(cli: Cli, recording: Path, tmp_pa
     assert other.read_text() == "precious"
 
 
-def test_cut_replaces_nothing_that_came_into_being_meanwhile(
+def test_cut_does_not_replace_a_file_created_in_the_meantime(
     cli: Cli, recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     out, savez = tmp_path / "cut.npz", np.savez
@@ -202,14 +202,14 @@ def test_cut_overwrites_nothing(cli: Cli, recording: Path, tmp_path: Path) -> No
     assert answer.code == 2
 
 
-def test_cut_outside_says_what_is_there(cli: Cli, recording: Path, tmp_path: Path) -> None:
+def test_cut_outside_names_the_available_lines(cli: Cli, recording: Path, tmp_path: Path) -> None:
     answer = cli("cut", recording, "--first-line", 160, "--lines", 20, "--out", tmp_path / "c.npz")
     assert answer.code == 2
     assert "possible: lines 100 to 163" in answer.err
     assert not (tmp_path / "c.npz").exists()
 
 
-def test_verify_says_which_lines_are_lost_and_ends_with_6(cli: Cli, recording: Path) -> None:
+def test_verify_names_lost_lines_and_exits_with_6(cli: Cli, recording: Path) -> None:
     answer = cli("verify", recording)
     assert (answer.code, answer.out.split("; ")[0]) == (0, f"{recording}: intact")
     (recording / "b" / "tick" / "c" / "0").unlink()
@@ -220,7 +220,7 @@ def test_verify_says_which_lines_are_lost_and_ends_with_6(cli: Cli, recording: P
     assert (found.code, found.json["damage"][0]["count"]) == (6, 64)
 
 
-def test_recover_seals_what_its_writer_left(cli: Cli, tmp_path: Path) -> None:
+def test_recover_seals_an_unfinished_recording(cli: Cli, tmp_path: Path) -> None:
     path = tmp_path / "left.zarr"
     with RecordingWriter.create(path, spec()) as writer:
         for arm in ARMS:
@@ -259,7 +259,7 @@ def test_hold_keeps_lines_of_a_recording_that_grows(cli: Cli, tmp_path: Path) ->
         assert cli("cut", path, "--first-line", FIRST, "--lines", 5, "--out", tmp_path / "c.npz").code == 0
 
 
-def test_what_a_copy_still_needs_is_held_without_an_end(cli: Cli, tmp_path: Path) -> None:
+def test_lines_that_a_copy_needs_are_held_without_an_end(cli: Cli, tmp_path: Path) -> None:
     path = tmp_path / "endless.zarr"
     policy = Retention(max_age_lines=16, margin_lines=4, copied_to=f"memory://{tmp_path.name}")
     with RecordingWriter.create(path, replace(spec(), retention=policy, shard_chunks=1)) as writer:
@@ -283,7 +283,7 @@ def test_recordings_at_urls(cli: Cli, recording: Path, tmp_path: Path) -> None:
 
 
 def test_lines_that_do_not_follow_the_code_are_named(tmp_path: Path, cli: Cli) -> None:
-    """Each stretch of each arm, the last one to the end; what was doubted before its end is one stretch."""
+    """Each range of each arm is listed, the last one up to the end; overlapping doubts form one range."""
     path = tmp_path / "r.zarr"
     with RecordingWriter.create(path, spec()) as writer:
         for arm in ARMS:
@@ -300,8 +300,8 @@ def test_lines_that_do_not_follow_the_code_are_named(tmp_path: Path, cli: Cli) -
             writer.add_event(kind, 0, line, text)
         writer.seal(RunCondition.TAINTED, "stopped", {})
     stretches = [("a", 110, 10, "inverted"), ("b", 150, 14, "shifted by +3 sub-steps")]
-    told = cli("info", path, "--json").json["suspect"]
-    assert [tuple(one.values()) for one in told] == stretches
+    suspect = cli("info", path, "--json").json["suspect"]
+    assert [tuple(one.values()) for one in suspect] == stretches
     assert "a 110 to 119 (inverted), b 150 to 163 (shifted by +3 sub-steps)" in cli("info", path).out
     verified = cli("verify", path)
     assert verified.code == 0  # they are there, and as they were recorded
@@ -311,7 +311,7 @@ def test_lines_that_do_not_follow_the_code_are_named(tmp_path: Path, cli: Cli) -
 HOSTILE = "\x1b[2J\x9b31m\u202eDOOG\n/d/forged.zarr: intact\udcff"
 
 
-def test_what_others_wrote_reaches_no_terminal_as_it_is(cli: Cli, recording: Path) -> None:
+def test_foreign_text_is_escaped_before_it_reaches_a_terminal(cli: Cli, recording: Path) -> None:
     root = recording / "zarr.json"
     meta = json.loads(root.read_text())
     meta["attributes"] |= {"end_reason": HOSTILE, "run_id": HOSTILE}

@@ -1,4 +1,4 @@
-"""What every command has in common: help with an example, errors in words, exit codes, quick start."""
+"""Properties that all commands share: help with an example, errors in words, exit codes, quick start."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def test_version(cli: Cli) -> None:
 @pytest.mark.parametrize(
     "words", [("stauts",), ("start", "--line", "5"), ("cut",), ("start", "--lines", "x")]
 )
-def test_wrong_words_are_exit_2(cli: Cli, words: list[str]) -> None:
+def test_wrong_arguments_exit_with_2(cli: Cli, words: list[str]) -> None:
     assert cli(*words).code == 2
 
 
@@ -78,7 +78,7 @@ def test_help_fits_a_narrow_terminal_and_cuts_no_name(
         (("trigger", "lod"), "acquire trigger", "trigger: there is no command 'lod'"),
     ],
 )
-def test_wrong_words_are_told_in_the_voice_of_all_errors(
+def test_wrong_arguments_are_reported_like_all_errors(
     cli: Cli, words: tuple[str, ...], command: str, message: str
 ) -> None:
     answer = cli(*words)
@@ -90,7 +90,7 @@ def test_wrong_words_are_told_in_the_voice_of_all_errors(
     assert (error["kind"], error["exit_code"], error["hint"]) == ("UsageError", 2, f"{command} --help")
 
 
-def test_what_is_wider_than_the_terminal_is_shown_without_breaking_a_word(
+def test_text_wider_than_the_terminal_is_wrapped_between_words(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     rows = [("run.zarr", "1000", "in good order"), ("other.zarr", "2", "")]
@@ -182,7 +182,7 @@ def test_status_loads_no_models_or_mathematics(tmp_path: Path) -> None:
     assert ended.stdout.strip() == "[]"
 
 
-def test_what_the_system_refuses_is_told_in_words(cli: Cli, tmp_path: Path) -> None:
+def test_errors_of_the_system_are_reported_in_words(cli: Cli, tmp_path: Path) -> None:
     answer = cli("info", tmp_path / ("long" * 100))
     assert answer.code in {2, 6}
     assert "File name too long" in answer.err

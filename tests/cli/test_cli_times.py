@@ -50,7 +50,7 @@ def test_durations(text: str, ns: int) -> None:
 
 
 @pytest.mark.parametrize("text", ["", "five", "5 parsecs", "-1s", "nan", "1e400", "L5"])
-def test_what_is_no_duration_is_refused_with_what_is(text: str) -> None:
+def test_an_invalid_duration_is_refused_with_valid_ones(text: str) -> None:
     with pytest.raises(UsageError, match="cannot be read") as refused:
         parse_duration_ns(text)
     assert "500ms" in str(refused.value.possible)
@@ -87,15 +87,15 @@ def test_moments() -> None:
     ],
     ids=" ".join,
 )
-def test_a_stretch_can_be_said_in_lines_and_in_times(
+def test_a_range_is_given_in_lines_or_in_times(
     cli: Cli, recording: Path, tmp_path: Path, words: tuple[str, ...]
 ) -> None:
     assert cli("cut", recording, *words, "--out", tmp_path / "part.npz").code == 0
     assert np.load(tmp_path / "part.npz")["lines"].shape[1] == 90
     cut = cli("export", recording, tmp_path / "part2.npz", *words, "--json").json
     assert cut["shape"] == [2, 90, 8]
-    told = cli("diagnose", recording, *words, "--json").json
-    assert (told["first_line"], told["lines"]) == (300, 90)
+    diagnosed = cli("diagnose", recording, *words, "--json").json
+    assert (diagnosed["first_line"], diagnosed["lines"]) == (300, 90)
 
 
 @pytest.mark.parametrize(
@@ -108,7 +108,7 @@ def test_a_stretch_can_be_said_in_lines_and_in_times(
         (("--from", "L2000", "--lines", "9"), "has no line at or after L2000"),
     ],
 )
-def test_what_is_no_stretch_is_refused(
+def test_an_invalid_range_is_refused(
     cli: Cli, recording: Path, tmp_path: Path, words: tuple[str, ...], said: str
 ) -> None:
     answer = cli("cut", recording, *words, "--out", tmp_path / "part.npz")
@@ -117,7 +117,7 @@ def test_what_is_no_stretch_is_refused(
     assert not (tmp_path / "part.npz").exists()
 
 
-def test_hold_wants_both_ends(cli: Cli, recording: Path) -> None:
+def test_hold_requires_both_ends(cli: Cli, recording: Path) -> None:
     answer = cli("hold", recording, "--first-line", "5")
     assert answer.code == 2
     assert "--from and --to" in answer.err
@@ -145,8 +145,8 @@ def test_every_option_that_takes_a_time_takes_the_same_words() -> None:
     assert walk(typer.main.get_command(build()), "acquire") == []
 
 
-def test_help_of_each_option_stands_alone() -> None:
-    """Nothing that needs the option above it: no "Its end.", no "Of that", no "Of a panel."."""
+def test_help_of_each_option_is_complete() -> None:
+    """No help refers to the option above it: no "Its end.", no "Of that", no "Of a panel."."""
     leaning = ("Its ", "Of ", "Instead", "The same", "Repeatable", "Else")
 
     def walk(command: Any, path: str) -> list[str]:

@@ -38,14 +38,14 @@ def test_a_tree_and_a_version_are_ready_once(tmp_path: Path) -> None:
     root = checkout(tmp_path, "## 1.2.0 (unreleased)\n\n- **It** works.\n")
     assert release.tree_is_clean(root).startswith("at ")
     assert release.version_is_new(root) == "1.2.0, of which there is no tag"
-    assert "write the date" in release.changelog_tells_it(root)
+    assert "write the date" in release.changelog_describes_it(root)
     git(root, "tag", "v1.2.0")
     (root / "left.txt").touch()
     with pytest.raises(release.Undone, match=r"is released: it has a tag"):
         release.version_is_new(root)
     with pytest.raises(release.Undone, match=r"1 files differ from the last commit: left\.txt"):
         release.tree_is_clean(root)
-    items = {"tree": release.tree_is_clean, "changelog": release.changelog_tells_it}
+    items = {"tree": release.tree_is_clean, "changelog": release.changelog_describes_it}
     assert release.check(items, root) == 1
 
 
@@ -60,13 +60,13 @@ def test_a_tree_and_a_version_are_ready_once(tmp_path: Path) -> None:
         ("## 1.2.0\n\n- **It** works.\n", "a heading that is not"),
     ],
 )
-def test_the_changelog_tells_of_this_version(tmp_path: Path, changelog: str, said: str | None) -> None:
+def test_the_changelog_describes_this_version(tmp_path: Path, changelog: str, said: str | None) -> None:
     root = checkout(tmp_path, changelog)
     if said is None:
-        assert release.changelog_tells_it(root) == "tells of 1.2.0, 2026-01-31"
+        assert release.changelog_describes_it(root) == "describes 1.2.0, 2026-01-31"
         return
     with pytest.raises(release.Undone, match=said):
-        release.changelog_tells_it(root)
+        release.changelog_describes_it(root)
 
 
 def test_every_library_that_is_asked_for_has_a_version_that_is_allowed(

@@ -74,7 +74,7 @@ class FakeRun:
             end_reason=reason,
         )
 
-    def arm(self, tell: Callable[[str], object] = print) -> None:
+    def arm(self, progress: Callable[[str], object] = print) -> None:
         assert self.may_arm.wait(300)
         self._call("arm")
         self.seen = CALM

@@ -69,7 +69,7 @@ def test_a_rate_above_it_is_refused_unless_forced(measured: dict[str, Any], tmp_
     prove = make_proof(tmp_path)
     said: list[str] = []
     with pytest.raises(UsageError) as refused:
-        prove(force=False, tell=said.append)
+        prove(force=False, progress=said.append)
     assert "33333.3 lines/s" in refused.value.message
     assert "2e+04 lines/s, limited by recorder" in refused.value.possible
     assert "best of 3 measurements at a load of" in refused.value.possible
@@ -124,7 +124,7 @@ def test_where_nothing_can_be_written_nothing_is_proved(tmp_path: Path) -> None:
 
 
 def test_the_service_stays_idle_and_asks_no_device(tmp_path: Path) -> None:
-    def too_slow(*, force: bool, tell: Callable[[str], object]) -> CapacityStatus:
+    def too_slow(*, force: bool, progress: Callable[[str], object]) -> CapacityStatus:
         raise UsageError(f"too slow, {force}")
 
     def no_run(request: object) -> None:

@@ -70,7 +70,7 @@ def test_every_frame_size_fills_its_panel(shape) -> None:
     assert panel(np.ones(shape), 1.0).size == (PANEL_PX, PANEL_PX)
 
 
-def test_panels_stand_side_by_side_in_order(short: DemoResult) -> None:
+def test_panels_are_side_by_side_in_order(short: DemoResult) -> None:
     picture = np.asarray(draw_frame(short, 4).convert("L"))
     for i, video in enumerate([short.truth, *(solver.video for solver in short.solvers)]):
         left = i * (PANEL_PX + GAP_PX)

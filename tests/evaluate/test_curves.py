@@ -162,7 +162,7 @@ class TestCompareCurve:
         assert comparison.measured.residual_rms == pytest.approx(0.01, rel=0.1)
         assert comparison.rms_error == pytest.approx(0.15, rel=0.02)
 
-    def test_a_swing_that_was_lost_altogether_has_ratio_0(self) -> None:
+    def test_a_completely_lost_oscillation_has_ratio_0(self) -> None:
         comparison = compare_curve("x", sine(2500), np.full(FRAMES, 0.5), INTERVAL_S)
         assert comparison.amplitude_ratio == 0
         assert comparison.correlation is None

@@ -1,4 +1,4 @@
-"""Fig. 9's table from a video of four lamps: which is which is told by their light alone."""
+"""Fig. 9's table from a video of four lamps: they are identified by their light alone."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def video(order: tuple[int, ...], seed: int) -> np.ndarray:
 
 
 @pytest.mark.parametrize("order", [(0, 1, 2, 3), (3, 2, 1, 0), (1, 3, 0, 2)])
-def test_lamps_are_known_by_their_light_wherever_they_are(order: tuple[int, ...]) -> None:
+def test_lamps_are_identified_by_their_light_wherever_they_are(order: tuple[int, ...]) -> None:
     lamps = list(_lamps(video(order, 5), INTERVAL_S))
     names = ("x", "triangle", "circle", "equals")
     assert [lamp.name for lamp in lamps] == [names[lamp] for lamp in order]
@@ -37,7 +37,7 @@ def test_lamps_are_known_by_their_light_wherever_they_are(order: tuple[int, ...]
     assert rows["equals: constant"].startswith("constant, ripple")
 
 
-def test_what_is_dark_or_of_another_frequency_is_said() -> None:
+def test_dark_lamps_and_wrong_frequencies_are_reported() -> None:
     frames = video((0, 0, 2, 3), 6)
     frames[:, 16:, 16:] = 0.0
     t = np.arange(598) * INTERVAL_S

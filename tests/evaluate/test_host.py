@@ -1,4 +1,4 @@
-"""How busy the machine was, by what a thread really gets."""
+"""Load of the machine, from the processor time that a thread gets."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import sys
 from acquire.evaluate.host import HostWatch
 
 
-def test_a_core_that_another_uses_is_told() -> None:
+def test_a_core_in_use_by_others_is_reported() -> None:
     allowed = os.sched_getaffinity(0)
     core = min(allowed)
     spin = f"import os; os.sched_setaffinity(0, {{{core}}}); print(flush=True)\nwhile True: pass"
@@ -31,7 +31,7 @@ def test_a_core_that_another_uses_is_told() -> None:
     assert 1 <= found.facts()["least_share_percent"] <= found.facts()["share_percent"] < 80
 
 
-def test_who_has_not_looked_looks_when_asked() -> None:
+def test_load_is_measured_at_the_first_request() -> None:
     found = HostWatch().busyness()
     assert 0 < found.share == found.least_share <= 1
     assert found.cores >= 1

@@ -23,7 +23,7 @@ def curve(*values: float) -> Band:
     return Band(times_s, middle, middle, middle)
 
 
-def test_a_band_reaches_from_the_worst_to_the_best_repeat_and_answers_stand():
+def test_a_band_spans_the_repeats_and_its_end_value_persists():
     found = band([run((1, 10), (4, 20)), run((2, 12), (4, 26), repeat=1)], "psnr_db")
     assert found.times_s[0] == 2  # from then on both have an answer
     assert (found.low[0], found.middle[0], found.high[0]) == (10, 11, 12)
@@ -59,7 +59,7 @@ def test_sentences_say_what_time_buys(made: Run, said: str):
     assert any(said in sentence for sentence in sentences([made])), sentences([made])
 
 
-def test_nothing_is_said_where_the_truth_is_not_known():
+def test_no_sentence_without_a_known_truth():
     points = (Point(1, 1.0), Point(2, 2.0))
     assert sentences([Run("admm", Voxels(3, 1), "float32", 9, points)]) == []
 

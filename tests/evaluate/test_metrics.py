@@ -86,7 +86,7 @@ class TestRefusals:
             metric(np.ones((2, 12, 12)), np.ones((2, 12, 13)))
 
     @pytest.mark.parametrize("shape", [(12,), (1, 2, 12, 12), (0, 12, 12)])
-    def test_what_is_no_video(self, metric, shape) -> None:
+    def test_arrays_that_are_not_videos(self, metric, shape) -> None:
         with pytest.raises(UsageError):
             metric(np.ones(shape), np.ones(shape))
 
@@ -101,7 +101,7 @@ class TestRefusals:
             metric(truth, broken)
 
     @pytest.mark.parametrize("peak", [0.0, -1.0, np.nan])
-    def test_a_peak_that_is_none(self, metric, peak) -> None:
+    def test_an_invalid_peak(self, metric, peak) -> None:
         video, truth = random_pair(6, (2, 12, 12))
         with pytest.raises(UsageError, match="peak"):
             metric(video, truth, peak)

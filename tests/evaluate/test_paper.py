@@ -1,4 +1,4 @@
-"""Contrast of the bars of a target, as Fig. 6c plots it, and what stands against the paper."""
+"""Contrast of the bars of a target, as Fig. 6c plots it, and the comparison with the paper."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def test_reached_is_equal_and_only_beyond_is_better() -> None:
         (0.98, False, "does not hold"),
     ],
 )
-def test_words_hold_or_do_not_and_are_never_better(r: float, expected: bool, verdict: str) -> None:
+def test_claims_in_words_hold_or_not_and_are_never_better(r: float, expected: bool, verdict: str) -> None:
     assert captured("pulses", "captured", r, expected=expected).verdict == verdict
 
 

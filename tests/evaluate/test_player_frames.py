@@ -1,4 +1,4 @@
-"""Frames for a page's player: small, bounded, and those that were given."""
+"""Frames for a page's player: small and bounded, and the given ones."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ def opened(uri: str) -> np.ndarray:
 
 
 def noise(frames: int) -> list[Image.Image]:
-    """What compresses worst."""
+    """Frames that compress worst."""
     rng = np.random.default_rng(2)
     return [
         beside([rng.uniform(0, 1, (64, 64)) * 0.5 + number / frames / 2], 1.0) for number in range(frames)
@@ -38,17 +38,17 @@ def test_frames_are_thinned_evenly_until_they_fit(bound: int) -> None:
     assert np.diff(means) == pytest.approx(step * 255 / 80, abs=1.5)
 
 
-def test_what_fits_is_shown_whole() -> None:
+def test_frames_that_fit_are_all_shown() -> None:
     clip = clip_of(noise(5))
     assert (len(clip.frames), clip.step) == (5, 1)
 
 
-def test_it_begins_with_what_shows_most() -> None:
+def test_it_begins_with_the_frame_that_shows_most() -> None:
     dark, plain, telling = np.zeros((16, 16)), np.full((16, 16), 0.9), np.eye(16)
     assert clip_of([beside([each], 1.0) for each in (dark, plain, telling, dark)]).start == 2
 
 
-def test_frames_of_other_sizes_stand_side_by_side_at_one_height() -> None:
+def test_frames_of_different_sizes_are_scaled_to_one_height() -> None:
     small, large = np.full((8, 8), 0.5), np.eye(24)
     picture = np.asarray(beside([small, large], 1.0).convert("L"), int)
     assert picture.shape == (24, 24 + 1 + 24)

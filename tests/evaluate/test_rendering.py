@@ -54,7 +54,7 @@ def test_panels_of_other_intervals_share_the_clock(tmp_path):
     assert shown == [(i + 3) // 10 for i in range(40)]
 
 
-def test_what_cannot_be_rendered_is_refused(tmp_path):
+def test_impossible_renderings_are_refused(tmp_path):
     one = panel(tmp_path, "a", 5, 1000)
     with pytest.raises(UsageError, match=r"\.mp4"):
         render([one], tmp_path / "m.avi", Look(), 5)

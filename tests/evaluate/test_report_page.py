@@ -96,12 +96,12 @@ def test_every_text_of_the_summary_is_on_the_page(result: DemoResult, page: Page
     assert "2025-06-07 08:09 UTC" in page.text
 
 
-def test_losses_stand_with_their_causes(page: Page) -> None:
+def test_losses_are_listed_with_their_causes(page: Page) -> None:
     assert "lost: camera 0 2 lost: ring full 0 14" in page.text
     assert "discarded while armed 7 11" in page.text
 
 
-def test_how_busy_the_machine_was_is_told(page: Page) -> None:
+def test_the_load_of_the_machine_is_reported(page: Page) -> None:
     assert "a busy thread got 63 % of a core, and at worst 41 %" in page.text
     assert "The machine was busy; on an idle machine, this takes less time." in page.text
 
@@ -121,7 +121,7 @@ def test_the_page_refers_to_nothing_outside_itself(source: str, page: Page) -> N
     assert all(value.startswith("data:") for value in references)
 
 
-def test_pictures_have_a_text_and_are_those_beside_the_page(directory, page: Page) -> None:
+def test_pictures_have_alternative_texts_and_are_the_files_next_to_the_page(directory, page: Page) -> None:
     images = [value for tag, name, value in page.attributes if (tag, name) == ("img", "src")]
     texts = [value for tag, name, value in page.attributes if (tag, name) == ("img", "alt")]
     assert len(images) == len(texts) == 5

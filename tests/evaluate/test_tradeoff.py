@@ -1,4 +1,4 @@
-"""The trade-off: what is measured on the way of one run, the front, the page and the table."""
+"""The trade-off: intermediate results of one run, the front, the page and the table."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def run(judge):
     return measure(judge, "admm", VOXELS)
 
 
-def test_one_run_is_looked_at_on_its_way(judge, run):
+def test_intermediate_results_of_one_run_are_evaluated(judge, run):
     assert all(one.seconds < other.seconds for one, other in pairwise(run.points))
     assert all(one.processor_s <= other.processor_s for one, other in pairwise(run.points))
     assert all(one.iterations <= other.iterations for one, other in pairwise(run.points))
@@ -62,7 +62,7 @@ def test_one_run_is_looked_at_on_its_way(judge, run):
     assert run.mean_db == pytest.approx(10 * np.log10(true.max() ** 2 / true.var(axis=0).mean()), abs=0.01)
 
 
-def test_a_run_that_its_budget_ends_is_cut(judge):
+def test_a_run_that_exceeds_its_budget_is_marked_as_cut(judge):
     short = measure(judge, "twist", VOXELS, "best", 0.2)
     assert short.cut
     assert not replace(short, ended="converged").cut
@@ -92,7 +92,7 @@ def test_full_wells_are_electrons_or_clean():
         full_wells(["dirty"])
 
 
-def test_amplitudes_that_are_half_are_wrong_by_half():
+def test_halved_amplitudes_have_an_error_of_one_half():
     truth = np.sin(np.arange(40))[:, None, None] * np.ones((40, 3, 3))
     assert amplitude_error(0.5 * truth + 7, truth) == pytest.approx(0.5)
     assert amplitude_error(truth, np.ones_like(truth)) is None
@@ -102,7 +102,7 @@ def point(iterations, seconds, decibel):
     return Point(iterations, seconds, psnr_db=decibel)
 
 
-def test_the_front_is_what_nothing_reaches_sooner():
+def test_the_front_holds_results_that_nothing_reaches_sooner():
     slow = Run("twist", VOXELS, "float32", 9, (point(1, 1.0, 5.0), point(2, 9.0, 30.0)))
     fast = Run("admm", VOXELS, "float32", 9, (point(1, 2.0, 20.0), point(2, 4.0, 19.0)))
     assert [(each.solver, at.iterations) for each, at in pareto([slow, fast])] == [
@@ -113,7 +113,7 @@ def test_the_front_is_what_nothing_reaches_sooner():
     assert [row["pareto"] for row in table([slow, fast])] == [True, True, True, False]
 
 
-def test_page_and_table_say_the_same(judge, run, tmp_path):
+def test_page_and_table_agree(judge, run, tmp_path):
     cut = replace(run, repeat=1, ended="budget")
     exact = replace(run, dtype="float64", case="another")
     true = judge.truth(VOXELS)[judge.picked(VOXELS)]

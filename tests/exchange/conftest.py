@@ -52,7 +52,7 @@ def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="session")
 def video(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """20 frames of 7 x 5 pixels, of which `TRUSTED` are."""
+    """A video of 20 frames of 7 x 5 pixels, of which `TRUSTED` are trusted."""
     path = tmp_path_factory.mktemp("videos") / "video.zarr"
     frames = np.random.default_rng(6).random((20, 7, 5)).astype(np.float32)
     time_ns = TIME + INTERVAL_NS * np.arange(20, dtype=np.int64)
@@ -63,7 +63,7 @@ def video(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="session")
 def told(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A video of 20 frames of 9 x 5 pixels that tells its error."""
+    """A video of 20 frames of 9 x 5 pixels with an estimated error."""
     path, generator = tmp_path_factory.mktemp("told") / "told.zarr", np.random.default_rng(7)
     error = {"rms": 0.02, "low": 0.01, "high": 0.05, "full_scale": 0.5}
     with VideoWriter(

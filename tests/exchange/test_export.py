@@ -1,4 +1,4 @@
-"""``acquire export``: its files, opened by the libraries that everybody opens them with."""
+"""``acquire export``: its files, opened with the usual libraries."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ def test_imagej_has_axes_interval_and_pixel_size(cli: Cli, video: Path, tmp_path
     assert [path.name for path in tmp_path.iterdir()] == ["v.tif"]
 
 
-def test_ome_tiff_says_the_same(cli: Cli, video: Path, tmp_path: Path) -> None:
+def test_ome_tiff_has_the_same_metadata(cli: Cli, video: Path, tmp_path: Path) -> None:
     assert cli("export", video, tmp_path / "v.ome.tif")[0] == 0
     with tifffile.TiffFile(tmp_path / "v.ome.tif") as file:
         assert file.is_bigtiff
@@ -95,7 +95,7 @@ def test_nexus_plots_the_video_by_default(cli: Cli, video: Path, tmp_path: Path)
 IN_WORDS = "about 4 % of full scale (2 to 10 % in nine of ten)"
 
 
-def test_the_error_that_a_video_tells_is_taken_along(cli: Cli, told: Path, tmp_path: Path) -> None:
+def test_the_estimated_error_of_a_video_is_exported(cli: Cli, told: Path, tmp_path: Path) -> None:
     source = open_video(told)
     assert source.error is not None
     error, frames = source.error[3:17], source.video[3:17]
@@ -121,7 +121,7 @@ def test_the_error_that_a_video_tells_is_taken_along(cli: Cli, told: Path, tmp_p
         assert json.loads(str(saved["facts"]))["estimated_error"] == IN_WORDS
 
 
-def test_a_file_without_a_place_for_the_error_is_told_of(cli: Cli, told: Path, tmp_path: Path) -> None:
+def test_formats_without_room_for_the_error_are_reported(cli: Cli, told: Path, tmp_path: Path) -> None:
     for name in ("v.mp4", "v.npy", "v.tif"):
         assert (
             f"{name} does not hold the estimated error of the regions"
@@ -267,7 +267,7 @@ def test_times_choose_lines(cli: Cli, recording: Path, tmp_path: Path) -> None:
         (["video", "no/v.npy"], "does not exist"),
     ],
 )
-def test_what_cannot_be_is_refused_and_nothing_touched(
+def test_impossible_requests_are_refused_and_nothing_is_changed(
     cli: Cli, recording: Path, video: Path, tmp_path: Path, words: list[Any], said: str
 ) -> None:
     source = {"run": recording, "video": video}.get(words[0], tmp_path / "absent.zarr")
@@ -293,7 +293,7 @@ def test_a_library_that_is_missing_is_named_with_its_extra(
     assert not list(tmp_path.iterdir())
 
 
-def test_an_image_too_large_for_imagej_is_told_of_ome(
+def test_an_image_too_large_for_imagej_suggests_ome(
     video: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, cli: Cli
 ) -> None:
     monkeypatch.setattr(tiff, "MOST_BYTES", 100)

@@ -1,4 +1,4 @@
-"""Files of other programs that are cut short, damaged or packed: refused by name, and unpacked once."""
+"""Files of other programs that are cut short, damaged or packed: refused with a reason, or unpacked once."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def test_a_cut_numpy_file_is_refused_as_lines_and_as_code(tmp_path: Path, raw: b
 @pytest.mark.parametrize(
     "values", [np.zeros(3, [("bit", "u1")]), np.ones(3, np.complex64), np.ones((2, 3)), np.uint8(1)]
 )
-def test_what_is_no_row_of_real_numbers_holds_no_bits(tmp_path: Path, values: np.ndarray) -> None:
+def test_only_a_row_of_real_numbers_is_accepted_as_code_bits(tmp_path: Path, values: np.ndarray) -> None:
     path = tmp_path / "code.npy"
     np.save(path, values)
     with pytest.raises(UsageError, match="does not hold bits"):

@@ -1,4 +1,4 @@
-"""``acquire import``: lines as other programs store them become the recording that they were."""
+"""``acquire import``: lines stored by other programs become the original recording."""
 
 from __future__ import annotations
 
@@ -91,7 +91,7 @@ def as_raw(directory: Path, lines: dict[str, Any]) -> list[Any]:
 
 
 def as_columns(directory: Path, lines: dict[str, Any]) -> list[Any]:
-    """Both arms on one sensor, with dark pixels about them."""
+    """Both arms on one sensor, surrounded by dark pixels."""
     dark = np.zeros((LINES, 3), np.uint16)
     np.save(directory / "wide.npy", np.hstack([dark, lines["a"], dark, lines["b"]]))
     words = ("--columns-a", f"3:{3 + STAGES}", "--columns-b", f"{6 + STAGES}:{6 + 2 * STAGES}")
@@ -99,7 +99,7 @@ def as_columns(directory: Path, lines: dict[str, Any]) -> list[Any]:
 
 
 @pytest.mark.parametrize("write", [as_npy, as_tiff_pages, as_imagej, as_hdf5, as_raw, as_columns])
-def test_imported_lines_are_the_recording_that_they_were(
+def test_imported_lines_equal_the_original_recording(
     cli: Cli, original: Recording, lines: Any, tmp_path: Path, write: Any,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:  # fmt: skip
@@ -123,7 +123,7 @@ def test_imported_lines_are_the_recording_that_they_were(
     assert np.datetime64(int(two.time_ns[0]), "ns") == np.datetime64("2026-01-31T12:00:00")
 
 
-def test_a_rig_file_says_all_and_the_video_is_the_same(
+def test_a_rig_file_suffices_and_the_video_is_the_same(
     cli: Cli, original: Recording, lines: Any, tmp_path: Path
 ) -> None:
     rig = tmp_path / "rig.toml"
@@ -138,7 +138,7 @@ def test_a_rig_file_says_all_and_the_video_is_the_same(
     np.testing.assert_array_equal(*videos)
 
 
-def test_what_is_not_known_is_said(cli: Cli, lines: Any, tmp_path: Path) -> None:
+def test_unknown_properties_are_listed(cli: Cli, lines: Any, tmp_path: Path) -> None:
     files = as_npy(tmp_path, lines)
     code, out, err = cli("import", files[1], *SIZES, "--arm", "b", "--out", tmp_path / "b.zarr")
     assert (code, "150 lines of arm b" in out) == (0, True)
@@ -157,7 +157,7 @@ def test_what_is_not_known_is_said(cli: Cli, lines: Any, tmp_path: Path) -> None
 
 
 @pytest.mark.parametrize("form", ["hex", "text", "npy"])
-def test_listed_bits_are_a_code_too(
+def test_a_list_of_bits_is_accepted_as_a_code(
     cli: Cli, original: Recording, lines: Any, tmp_path: Path, form: str
 ) -> None:
     bits = original.cut(0, LINES).code
@@ -183,7 +183,7 @@ def test_listed_bits_are_a_code_too(
 def test_lines_from_the_middle_of_a_run_have_its_code(
     cli: Cli, original: Recording, lines: Any, tmp_path: Path
 ) -> None:
-    """By the number of the first line, or by the bit of the code that it begins with."""
+    """By the number of the first line, or by its first code bit."""
     middle = {arm: lines[arm][40:] for arm in ARMS}
     files = as_npy(tmp_path, middle)
     assert cli("import", *files, *SIZES, "--first-line", 40, "--out", tmp_path / "n.zarr")[0] == 0
@@ -232,7 +232,7 @@ def test_lines_from_the_middle_of_a_run_have_its_code(
         (["a.npy", "b.npy", "a.npy", *SIZES], "3 files of lines"),
     ],
 )
-def test_what_does_not_fit_is_refused_and_nothing_touched(
+def test_inconsistent_input_is_refused_and_nothing_is_written(
     cli: Cli, lines: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, words: list[Any], said: str
 ) -> None:
     as_npy(tmp_path, lines)
@@ -276,7 +276,7 @@ def test_a_file_that_was_cut_short_leaves_nothing(
     assert sorted(tmp_path.iterdir()) == sorted(files)
 
 
-def test_an_export_comes_back_as_it_was(cli: Cli, original: Recording, tmp_path: Path) -> None:
+def test_an_export_can_be_imported_again_unchanged(cli: Cli, original: Recording, tmp_path: Path) -> None:
     source = str(original.source)
     for name in ("lines.h5", "lines.tif", "lines.npy"):
         out = tmp_path / f"{name}.zarr"

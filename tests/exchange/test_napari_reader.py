@@ -1,4 +1,4 @@
-"""What napari is given: layers of data that are read when they are looked at. napari itself is not needed."""
+"""Data for napari: layers that are read when they are displayed. napari itself is not needed."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def test_a_video_is_its_trusted_frames_at_their_place(video: Path) -> None:
 @pytest.mark.parametrize(
     ("provenance", "words"), [({}, "not known"), ({"trusted": [2, 2]}, "no frame is trusted")]
 )
-def test_a_video_without_trusted_frames_says_so(tmp_path: Path, provenance: object, words: str) -> None:
+def test_a_video_without_trusted_frames_is_reported(tmp_path: Path, provenance: object, words: str) -> None:
     frames, times = np.zeros((4, 3, 3), np.float32), np.arange(4, dtype=np.int64)
     write_video(tmp_path / "v.zarr", frames, times, 1.0, 1.0, provenance)  # type: ignore[arg-type]
     read = reader_for(str(tmp_path / "v.zarr"))
@@ -87,7 +87,7 @@ def test_a_recording_is_pages_of_both_arms(recording: Path, monkeypatch: pytest.
         assert not data[2, 10:].any()
 
 
-def test_no_more_is_read_than_is_looked_at(recording: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_only_displayed_data_are_read(recording: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(lazy, "PAGE_LINES", 10)
     monkeypatch.setattr(lazy, "MOST_BYTES", 300)
     read_rows = []
@@ -106,7 +106,7 @@ def test_no_more_is_read_than_is_looked_at(recording: Path, monkeypatch: pytest.
     assert read_rows == [70]
 
 
-def test_what_is_not_ours_is_left_to_others(tmp_path: Path) -> None:
+def test_foreign_files_are_left_to_other_readers(tmp_path: Path) -> None:
     zarr.create_group(tmp_path / "g.zarr")
     (tmp_path / "bad.zarr").mkdir()
     (tmp_path / "bad.zarr" / "zarr.json").write_text(json.dumps([]))

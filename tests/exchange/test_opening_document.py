@@ -1,4 +1,4 @@
-"""OPENING.md: its commands are run, in their order, and its examples opened."""
+"""OPENING.md: its commands are run in order, and its examples executed."""
 
 from __future__ import annotations
 

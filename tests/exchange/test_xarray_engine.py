@@ -1,4 +1,4 @@
-"""``xarray.open_dataset(…, engine="acquire")``, and what xarray and zarr find without it."""
+"""``xarray.open_dataset(…, engine="acquire")``, and the view of xarray and zarr without it."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def test_a_video_has_its_coordinates(video: Path) -> None:
         assert "time" not in dataset.variables
 
 
-def test_what_is_not_there_is_told(recording: Path, video: Path) -> None:
+def test_missing_items_are_reported(recording: Path, video: Path) -> None:
     with pytest.raises(UsageError, match="possible: a, b"):
         xarray.open_dataset(recording, engine=AcquireBackend, group="c")
     with pytest.raises(UsageError, match="a video has no groups"):
@@ -65,7 +65,7 @@ def test_what_is_not_there_is_told(recording: Path, video: Path) -> None:
 
 
 def test_a_growing_recording_is_consistent_wherever_it_is_opened(tmp_path: Path) -> None:
-    """After every block, committed or not, zarr, xarray and the engine find rows that are all there."""
+    """After every block, committed or not, zarr, xarray and the engine find only complete rows."""
     path, code, clock = tmp_path / "grows.zarr", PrbsCode(15, 77), ClockFit(90_000_000, 10**18, 100)
     camera = {"white_dn": 255, "black_level_dn": 1.0, "responsivity_dn": 2.0}
     spec = RecordingSpec(
@@ -90,7 +90,7 @@ def test_a_growing_recording_is_consistent_wherever_it_is_opened(tmp_path: Path)
 
 
 def _rows(path: Path) -> int:
-    """Rows that all readers agree on, each with the line that belongs there."""
+    """Return the number of rows on which all readers agree, each with its own line."""
     lengths = set()
     group = zarr.open_group(path, mode="r")
     with xarray.open_dataset(path, engine=AcquireBackend, group="b") as dataset:

@@ -1,4 +1,4 @@
-"""Some tests need a compiler, yosys, a solver, LUNA; without it they are left out, and the run says so."""
+"""Some tests need a compiler, yosys, a solver, LUNA; without these they are skipped and reported."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The code as the gateware makes it equals `acquire.codes`, bit by bit."""
+"""The gateware's code equals `acquire.codes`, bit by bit."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def test_lfsr_makes_the_bits_of_its_python_twin(degree: int) -> None:
     assert made == prbs(degree, seed, 0, 300).tolist()
 
 
-def test_lfsr_waits_without_a_step() -> None:
+def test_lfsr_is_constant_without_a_step() -> None:
     lfsr = Lfsr()
 
     async def bench(context: Any) -> None:
@@ -66,7 +66,7 @@ def test_code_memory_plays_its_bits_and_begins_again(length: int) -> None:
 
 
 @pytest.mark.parametrize("length", [32, 33, 256])
-def test_code_memory_reads_back_and_sums_up_what_it_holds(length: int) -> None:
+def test_code_memory_reads_back_and_computes_the_crc_of_its_contents(length: int) -> None:
     memory, words = CodeMemory(8), [random.Random(7).getrandbits(32) for _ in range(8)]
     read: list[int] = []
 
@@ -99,14 +99,14 @@ async def fill(context: Any, memory: CodeMemory, words: list[int]) -> None:
 
 
 @pytest.mark.parametrize("fault", ["none", "memory", "prbs", "crc"])
-def test_the_self_test_tells_what_is_broken(fault: str) -> None:
+def test_the_self_test_reports_the_broken_part(fault: str) -> None:
     words = 4
     test = SelfTest(words)
     state, crc = expected(words)
     found: dict[str, int] = {}
 
     async def device(context: Any) -> None:
-        """A register, a memory and a sum, one of them broken."""
+        """A register, a memory and a CRC unit, one of them broken."""
         held, register = [0] * words, SEED
         for _ in range(60):
             context.set(test.state, register ^ (fault == "prbs" and register == state))

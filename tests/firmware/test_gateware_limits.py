@@ -1,4 +1,4 @@
-"""What the host and the model suppose of the gateware before they can ask it."""
+"""Assumptions of the host and the model about the gateware before they can ask it."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def test_the_light_is_dark_from_the_first_clock_on(light_low: bool) -> None:
 
 
 @pytest.mark.parametrize(("built_low", "pull"), [(False, "DOWN"), (True, "UP")])
-def test_a_board_is_pulled_and_asked_for_the_level_it_was_built_for(built_low: bool, pull: str) -> None:
+def test_pulls_and_rig_check_match_the_polarity_of_the_build(built_low: bool, pull: str) -> None:
     assert f'"led" IO_TYPE=LVCMOS33 PULLMODE={pull};' in ulx3s.constraints(ulx3s.PINS, built_low)
     said = Capabilities.read(Build(board=r.Board.ULX3S, light_low=built_low).constants())
     right, wrong = ("low", "high") if built_low else ("high", "low")
@@ -70,7 +70,7 @@ def test_the_watchdog_is_on_unless_it_is_turned_off() -> None:
         register_values(RUN, TriggerConfig(watchdog_s=60), GATEWARE, 3e5)
 
 
-def test_a_recording_s_watchdog_in_ticks_still_reads() -> None:
+def test_a_recorded_watchdog_in_ticks_is_still_readable() -> None:
     assert TriggerConfig.model_validate({"watchdog_ticks": 0}).watchdog_s == 0
     old = TriggerConfig.model_validate({"watchdog_ticks": 45_000_000, "clock_hz": 90_000_000})
     assert (old.watchdog_s, old.watchdog_ticks) == (0.5, 45_000_000)

@@ -1,4 +1,4 @@
-"""The link's gateware against zlib and the COBS package: every byte, and nothing believed that is wrong."""
+"""The link's gateware against zlib and the COBS package: every byte is right, no wrong one accepted."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The tagger alone: no event is left untold, whatever comes in the same clock."""
+"""The tagger alone: every event is reported, whatever happens in the same clock."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def run(events: dict[int, int], lines: set[int], full: range = range(0)) -> list
 
 
 @pytest.mark.parametrize(("apart", "line"), list(product(range(5), range(8, 14))))
-def test_events_near_each_other_and_near_a_line_are_all_told(apart: int, line: int) -> None:
+def test_events_close_to_each_other_and_to_a_line_are_all_reported(apart: int, line: int) -> None:
     events = {10: int(FIRST)}
     events[10 + apart] = events.get(10 + apart, 0) | int(SECOND)
     tags = run(events, {2, line})

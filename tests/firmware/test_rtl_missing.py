@@ -1,4 +1,4 @@
-"""A machine that cannot compile the gateware is told why, before anything is tried."""
+"""On a machine that cannot compile the gateware, the reason is reported before anything is tried."""
 
 from __future__ import annotations
 

@@ -64,7 +64,7 @@ SUBSTEPS = 2
 
 @dataclass(frozen=True)
 class Answer:
-    """What a command said."""
+    """Output and exit code of a command."""
 
     code: int
     out: str
@@ -141,7 +141,7 @@ class Daemon:
         return self.process.wait(END_S)
 
     def close(self) -> None:
-        """Whatever happened in the test: nothing of the daemon stays."""
+        """End everything that belongs to the daemon, whatever happened in the test."""
         if self.process.poll() is None:
             self.process.terminate()
             try:

@@ -34,7 +34,7 @@ from acquire.store import open_recording
 DOCUMENT = Path(__file__).parents[2] / "acquire/client/SCRIPTING.md"
 
 
-class Told:
+class Emitted:
     """The documents of a plan, each checked by event-model as it comes, and against what a reader finds."""
 
     def __init__(self) -> None:
@@ -55,7 +55,7 @@ class Told:
         return found
 
     def rows(self, resource: dict[str, Any]) -> int:
-        """That the resource's documents cover: from the first on, none left out, none twice."""
+        """Rows covered by the resource's documents: from the first on, without gaps or repetitions."""
         end = 0
         for datum in self.all("stream_datum"):
             if datum["stream_resource"] == resource["uid"]:
@@ -88,15 +88,15 @@ def engine() -> Iterator[RunEngine]:
 
 
 @pytest.fixture
-def told(engine: RunEngine) -> Iterator[Told]:
-    made = Told()
+def emitted(engine: RunEngine) -> Iterator[Emitted]:
+    made = Emitted()
     token = engine.subscribe(made)
     yield made
     engine.unsubscribe(token)
 
 
 def fly(recorder: Recorder, request: StartRequest | None, during: Callable[[], Any] = list) -> Any:
-    """The usual plan; ``during`` is a part of it once lines are recorded."""
+    """The usual plan; ``during`` is run once lines are recorded."""
 
     @bpp.stage_decorator([recorder])
     @bpp.run_decorator()
@@ -117,14 +117,14 @@ def until_committed(daemon: Daemon, lines: int = 600) -> None:
 
 
 def in_words(engine: RunEngine, plan: Any) -> str:
-    """What a plan fails with."""
+    """Return the message with which a plan fails."""
     with pytest.raises(FailedStatus) as failed:
         engine(plan)
     return str(failed.value.__cause__ or failed.value.args[0].exception())
 
 
-def test_a_recording_that_somebody_else_stops_first_is_completed(
-    daemon: Daemon, engine: RunEngine, told: Told, monkeypatch: pytest.MonkeyPatch
+def test_a_recording_that_another_client_stops_first_is_completed(
+    daemon: Daemon, engine: RunEngine, emitted: Emitted, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with init_devices(), daemon.client() as other:
         recorder = Recorder(daemon.socket, name="recorder")
@@ -137,12 +137,12 @@ def test_a_recording_that_somebody_else_stops_first_is_completed(
         monkeypatch.setattr(recorder._client, "stop", too_late)
     engine(fly(recorder, None))
     assert asked
-    (end,) = told.all("stop")
+    (end,) = emitted.all("stop")
     assert end["exit_status"] == "success"
 
 
 def test_the_example_s_documents_cover_exactly_the_recorded_lines(
-    daemon: Daemon, engine: RunEngine, told: Told, monkeypatch: pytest.MonkeyPatch
+    daemon: Daemon, engine: RunEngine, emitted: Emitted, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (example,) = re.findall(
         r"```python\n(import bluesky.*?)```", DOCUMENT.read_text(encoding="utf-8"), re.DOTALL
@@ -151,19 +151,19 @@ def test_the_example_s_documents_cover_exactly_the_recorded_lines(
     monkeypatch.setattr("bluesky.RunEngine", lambda: engine)
     monkeypatch.chdir(daemon.home)
     exec(example, {})
-    (start,) = told.all("start")
-    (descriptor,) = told.all("descriptor")
-    (stop,) = told.all("stop")
+    (start,) = emitted.all("start")
+    (descriptor,) = emitted.all("descriptor")
+    (stop,) = emitted.all("stop")
     assert (stop["run_start"], stop["exit_status"]) == (start["uid"], "success")
     assert descriptor["configuration"]["recorder"]["data"]["recorder-rig"] == "small"
-    resources = told.all("stream_resource")
+    resources = emitted.all("stream_resource")
     assert [one["data_key"] for one in resources] == ["recorder-a", "recorder-b"]
     recording = open_recording(path_of(resources[0]))
     assert recording.state == "sealed"
     assert recording.lines == 20_000  # of two seconds
-    assert len(told.all("stream_datum")) > 4  # while it grew
+    assert len(emitted.all("stream_datum")) > 4  # while it grew
     for one in resources:
-        assert told.rows(one) == recording.lines
+        assert emitted.rows(one) == recording.lines
         array = zarr.open_group(path_of(one), mode="r")[one["parameters"]["dataset"]]
         assert isinstance(array, zarr.Array)
         key = descriptor["data_keys"][one["data_key"]]
@@ -177,7 +177,7 @@ def test_the_example_s_documents_cover_exactly_the_recorded_lines(
 
 
 def test_without_a_budget_complete_ends_it_and_an_armed_instrument_stays_armed(
-    daemon: Daemon, engine: RunEngine, told: Told
+    daemon: Daemon, engine: RunEngine, emitted: Emitted
 ) -> None:
     recorder = Recorder(daemon.socket, name="recorder")
     with daemon.client() as client:
@@ -186,10 +186,12 @@ def test_without_a_budget_complete_ends_it_and_an_armed_instrument_stays_armed(
         assert client.status().state is State.ARMED
         recording = client.open()
     assert recording.attrs["end_reason"] == "stopped"
-    assert set(told.covered().values()) == {recording.lines}
+    assert set(emitted.covered().values()) == {recording.lines}
 
 
-def test_what_cannot_be_is_refused_in_words(daemon: Daemon, engine: RunEngine, tmp_path: Path) -> None:
+def test_impossible_requests_are_refused_with_an_explanation(
+    daemon: Daemon, engine: RunEngine, tmp_path: Path
+) -> None:
     recorder = Recorder(daemon.socket, name="recorder")
 
     def unstaged() -> Any:
@@ -215,12 +217,12 @@ def test_what_cannot_be_is_refused_in_words(daemon: Daemon, engine: RunEngine, t
     assert mocked.name == "mocked"
 
 
-def test_an_aborted_plan_stops_the_recording(daemon: Daemon, engine: RunEngine, told: Told) -> None:
+def test_an_aborted_plan_stops_the_recording(daemon: Daemon, engine: RunEngine, emitted: Emitted) -> None:
     recorder = Recorder(daemon.socket, name="recorder")
 
     def interrupt() -> None:
         until_committed(daemon)
-        until(lambda: told.covered() != {})
+        until(lambda: emitted.covered() != {})
         engine.request_pause()
 
     interrupting = threading.Thread(target=interrupt)
@@ -229,17 +231,17 @@ def test_an_aborted_plan_stops_the_recording(daemon: Daemon, engine: RunEngine, 
         engine(fly(recorder, StartRequest(duration_s=600.0)))
     interrupting.join()
     engine.abort("the sample has melted")
-    (stop,) = told.all("stop")
+    (stop,) = emitted.all("stop")
     assert stop["exit_status"] == "abort"
     with daemon.client() as client:
         assert client.status().state is State.IDLE
         recording = client.open()
     assert (recording.state, recording.attrs["end_reason"]) == ("sealed", "stopped")
-    assert all(0 < rows <= recording.lines for rows in told.covered().values())
+    assert all(0 < rows <= recording.lines for rows in emitted.covered().values())
 
 
-def test_a_fault_and_a_stop_by_somebody_else_fail_the_status_with_words(
-    daemon: Daemon, engine: RunEngine, told: Told
+def test_a_fault_and_a_foreign_stop_fail_the_status_with_an_explanation(
+    daemon: Daemon, engine: RunEngine, emitted: Emitted
 ) -> None:
     recorder = Recorder(daemon.socket, name="recorder")
     long = StartRequest(duration_s=600.0)
@@ -262,14 +264,14 @@ def test_a_fault_and_a_stop_by_somebody_else_fail_the_status_with_words(
 
     fault = "fault: the recording was aborted: write error: "
     assert in_words(engine, fly(recorder, long, lose_the_directory)).startswith(fault)
-    assert [one["exit_status"] for one in told.all("stop")] == ["fail", "fail"]
+    assert [one["exit_status"] for one in emitted.all("stop")] == ["fail", "fail"]
     assert in_words(engine, fly(recorder, long)).startswith(fault)  # it waits to be read
     with daemon.client() as client:
         assert client.disarm().state is State.IDLE
 
 
-def test_a_daemon_that_is_killed_fails_the_status_and_what_it_committed_is_told(
-    daemon: Daemon, engine: RunEngine, told: Told, monkeypatch: pytest.MonkeyPatch
+def test_a_killed_daemon_fails_the_status_and_its_committed_lines_are_reported(
+    daemon: Daemon, engine: RunEngine, emitted: Emitted, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("acquire.bluesky.recorder.PATIENCE_S", 1.0)
 
@@ -280,18 +282,16 @@ def test_a_daemon_that_is_killed_fails_the_status_and_what_it_committed_is_told(
 
     failure = in_words(engine, fly(Recorder(daemon.socket, name="recorder"), StartRequest(lines=10**7), kill))
     assert str(daemon.socket) in failure
-    (recording,) = {path_of(one) for one in told.all("stream_resource")}
-    assert min(told.covered().values()) > 600
-    assert max(told.covered().values()) <= open_recording(recording).lines
+    (recording,) = {path_of(one) for one in emitted.all("stream_resource")}
+    assert min(emitted.covered().values()) > 600
+    assert max(emitted.covered().values()) <= open_recording(recording).lines
 
 
-def test_a_recorder_that_is_replaced_is_a_further_resource(
-    daemon: Daemon, engine: RunEngine, told: Told
-) -> None:
+def test_a_replaced_recorder_adds_a_resource(daemon: Daemon, engine: RunEngine, emitted: Emitted) -> None:
     path = daemon.home / "x.zarr"
 
     def kill_the_recorder() -> None:
-        until(lambda: min(told.covered().values(), default=0) > 600)
+        until(lambda: min(emitted.covered().values(), default=0) > 600)
         with daemon.client() as client:
             psutil.Process(client.status().processes["recorder"]).kill()
 
@@ -300,7 +300,7 @@ def test_a_recorder_that_is_replaced_is_a_further_resource(
     engine(fly(Recorder(daemon.socket, name="recorder"), StartRequest(path=path, duration_s=12.0)))
     killing.join()
     first, second = open_recording(path), open_recording(daemon.home / "x-2.zarr")
-    rows = told.covered()
+    rows = emitted.covered()
     for arm in ("a", "b"):
         of_first, of_second = rows["x.zarr", f"recorder-{arm}"], rows["x-2.zarr", f"recorder-{arm}"]
         assert 600 < of_first <= first.lines
@@ -309,7 +309,7 @@ def test_a_recorder_that_is_replaced_is_a_further_resource(
         assert of_first + of_second == 120_000
 
 
-def test_without_the_extra_it_says_which() -> None:
+def test_a_missing_extra_is_named() -> None:
     program = """
 import sys
 class Without:

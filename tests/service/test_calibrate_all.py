@@ -1,4 +1,4 @@
-"""The guided calibration on a running daemon: what is before the cameras is changed as it asks for it."""
+"""The guided calibration on a running daemon: the scene is changed at its prompts."""
 
 from __future__ import annotations
 
@@ -78,7 +78,7 @@ def target() -> str:
 
 @pytest.fixture
 def bench(tmp_path: Path) -> Iterator[tuple[Daemon, Callable[[str], None]]]:
-    """A daemon, and what puts a scene before its cameras."""
+    """A daemon, and a function that puts a scene in front of its cameras."""
 
     def put(scene: str) -> None:
         fresh = tmp_path / "fresh.toml"
@@ -136,11 +136,11 @@ def test_dark_flat_target_by_hand(bench: tuple[Daemon, Callable[[str], None]], t
 
 
 def _handed_on(daemon: Daemon, home: Path) -> None:
-    """From then on every recording gets a copy, unless it is asked to have none."""
+    """From then on every recording gets a copy, unless the user declines."""
     with daemon.client() as client:
-        told = client.arm().calibration
-        assert told is not None
-        assert told.carried
+        calibration = client.arm().calibration
+        assert calibration is not None
+        assert calibration.carried
         client.start(home / "run.zarr", lines=64)
         client.wait(SEALED, timeout_s=120)
         client.disarm()
@@ -155,10 +155,10 @@ def _handed_on(daemon: Daemon, home: Path) -> None:
     assert daemon("verify", home / "run.zarr").code == 0
 
 
-def test_what_goes_wrong_leaves_the_instrument_as_it_was(
+def test_failures_leave_the_instrument_as_it_was(
     bench: tuple[Daemon, Callable[[str], None]], tmp_path: Path
 ) -> None:
-    """Without a dark, a flat says nothing; and where nobody can press Enter, nothing is recorded."""
+    """A flat without a dark is refused, and without a terminal for Enter nothing is recorded."""
     daemon, _ = bench
     cal = tmp_path / "c.zarr"
     with daemon.client() as client:

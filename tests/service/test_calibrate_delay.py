@@ -1,4 +1,4 @@
-"""``acquire calibrate delay`` on a running daemon, ended half-way; and its recordings looked at once more."""
+"""``acquire calibrate delay`` on a running daemon, interrupted half-way, then evaluated again."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ LATE = (270, 360)
 """Ticks, of arms a and b."""
 
 
-def test_a_sweep_that_is_interrupted_keeps_what_it_has(tmp_path: Path) -> None:
+def test_an_interrupted_sweep_keeps_its_recordings(tmp_path: Path) -> None:
     (tmp_path / "scene.toml").write_text(SCENE)
     scene = f"simulation.scene='{tmp_path}/scene.toml'"
     daemon = Daemon(tmp_path, "trigger.substep_ticks=900", scene)
@@ -115,7 +115,7 @@ def test_a_step_whose_page_is_killed_leaves_the_instrument_as_it_was(tmp_path: P
 
 
 def _is_not_replaced_by_less(home: Path, places: list[str]) -> None:
-    """A part of a sweep does not replace a result with a smaller uncertainty."""
+    """A partial sweep does not replace a result with a smaller uncertainty."""
     cal, exposures = home / "again.zarr", [open_exposure(home / place) for place in places]
     known = open_calibration(cal)
     late = known.quantities["light_late_ticks"]

@@ -1,4 +1,4 @@
-"""The optics' blur in the guided calibration: where wanted, and refused where it cannot be told."""
+"""The optics' blur in the guided calibration: measured on request, and refused if it cannot be determined."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ sigma_e = 20.0
 
 
 def checkerboard(turn_deg: float) -> np.ndarray:
-    """Squares of 58 fine pixels; a pixel holds the mean of what covers it."""
+    """Squares of 58 fine pixels; each pixel has the mean over its area."""
     angle = np.deg2rad(turn_deg)
     at = (np.arange(N * FINER) + 0.5) / FINER - N / 2
     y, x = np.meshgrid(at, at, indexing="ij")
@@ -49,14 +49,14 @@ def checkerboard(turn_deg: float) -> np.ndarray:
 
 
 def put(home: Path, picture: np.ndarray) -> str:
-    """Before the cameras; the setting that names it."""
+    """Put it in front of the cameras; return the setting that names it."""
     np.save(home / "fresh.npy", picture[None])
     (home / "fresh.npy").replace(home / "scene.npy")
     (home / "scene.toml").write_text(f"kind = 'video'\npath = '{home}/scene.npy'\n{EFFECTS}")
     return f"simulation.scene='{home}/scene.toml'"
 
 
-def test_the_blur_is_found_after_the_others_and_what_they_found_is_kept(tmp_path: Path) -> None:
+def test_the_blur_is_measured_last_and_earlier_results_are_kept(tmp_path: Path) -> None:
     scene = put(tmp_path, np.full((N, N), 0.6, np.float32))
     cal = tmp_path / "cal.zarr"
     with contextlib.closing(Daemon(tmp_path, *SETTINGS, scene)) as daemon:
@@ -80,7 +80,7 @@ def test_the_blur_is_found_after_the_others_and_what_they_found_is_kept(tmp_path
             assert client.status().state == "idle"
 
 
-def test_lines_that_are_missing_each_time_are_told_with_how_the_recordings_ended(tmp_path: Path) -> None:
+def test_repeatedly_missing_lines_are_reported_with_the_ends_of_the_recordings(tmp_path: Path) -> None:
     scene = "kind = 'usaf'\n[[effects]]\nkind = 'dropped_lines'\nrate = 0.3\n"
     (tmp_path / "scene.toml").write_text(scene)
     with contextlib.closing(Daemon(tmp_path, f"simulation.scene='{tmp_path}/scene.toml'")) as daemon:
@@ -90,8 +90,8 @@ def test_lines_that_are_missing_each_time_are_told_with_how_the_recordings_ended
             assert client.status().state == "idle"
     assert refused.code == 6
     assert "3 recordings lacked lines" in refused.err
-    # A slow host may end a recording by a stall instead, or lose the code's state with its tags: what is promised
-    # is that each ends in a sentence of its own.
+    # A slow host may end a recording by a stall instead, or lose the code's state with its tags: what is
+    # promised is that each ends in a sentence of its own.
     ends = re.findall(r"of 1024 per arm \(([A-Z]+): ([^)]+)\)", refused.err)
     assert len(ends) == 4, refused.err
     assert ("INCOMPLETE", "line budget reached") in ends
@@ -108,7 +108,7 @@ def test_lines_that_are_missing_each_time_are_told_with_how_the_recordings_ended
         ),
     ],
 )
-def test_a_rig_that_cannot_tell_is_refused_before_anything_is_recorded(
+def test_an_unsuitable_rig_is_refused_before_anything_is_recorded(
     tmp_path: Path, settings: tuple[str, ...], asked: tuple[str, ...], why: str
 ) -> None:
     with contextlib.closing(Daemon(tmp_path, *settings)) as daemon:

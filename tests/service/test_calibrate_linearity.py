@@ -1,4 +1,4 @@
-"""``acquire calibrate linearity`` on a running daemon: the ramp, what is kept, and a second look at it."""
+"""``acquire calibrate linearity`` on a running daemon: the ramp, the saved result, another evaluation."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ bow = 0.02
 SETTINGS = ("trigger.substep_ticks=900", *(f"cameras.{arm}.black_level_dn=20.0" for arm in "ab"))
 
 
-def test_a_ramp_tells_the_curve_and_the_electrons(tmp_path: Path) -> None:
+def test_a_ramp_determines_the_curve_and_the_gain(tmp_path: Path) -> None:
     (tmp_path / "scene.toml").write_text(SCENE)
     bright = [f"cameras.{arm}.responsivity_dn=160.0" for arm in "ab"]  # whole sub-steps are at 1.25 of white
     daemon = Daemon(tmp_path, *SETTINGS, *bright, f"simulation.scene='{tmp_path}/scene.toml'")

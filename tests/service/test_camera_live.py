@@ -1,4 +1,4 @@
-"""``acquire camera live`` beside a daemon that records: it sees the lines, and takes none away."""
+"""``acquire camera live`` next to a recording daemon: it sees the lines and takes none away."""
 
 from __future__ import annotations
 
@@ -33,8 +33,8 @@ def test_an_observer_of_the_daemon_s_rings(tmp_path: Path) -> None:
         assert "a" not in only_b
         lines = open_recording(tmp_path / "run.zarr").camera("a").lines[:]
         # on a busy host no line may come within a turn
-        *_, told = [turn["a"] for turn in turns if turn["a"]["level"] is not None]
-        assert told["level"] == pytest.approx(lines.mean() / 4095, rel=0.1)
-        assert told["saturated"] == pytest.approx((lines == 4095).mean(), abs=0.01)
+        *_, reading = [turn["a"] for turn in turns if turn["a"]["level"] is not None]
+        assert reading["level"] == pytest.approx(lines.mean() / 4095, rel=0.1)
+        assert reading["saturated"] == pytest.approx((lines == 4095).mean(), abs=0.01)
     finally:
         daemon.close()

@@ -35,7 +35,7 @@ def test_the_example_arms_records_marks_cuts_and_reconstructs(
 
 
 def test_the_quick_status_is_the_client_s(tmp_path: Path) -> None:
-    """What `acquire status` shows without the models is what they show."""
+    """`acquire status` shows the same without the models as with them."""
     with contextlib.closing(Daemon(tmp_path, "stream.ring_slots=64")) as daemon:
         quick = status_document(daemon.socket)
         full = Client(daemon.socket).status().model_dump(mode="json")

@@ -1,4 +1,4 @@
-"""A daemon whose disk or recorder pauses: waited out, told, and gone on after, without anybody's help."""
+"""A daemon whose disk or recorder pauses: it waits, reports the pause, and continues without help."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ SMALL_DISK = "recording.reserve_gb=0.01"
 
 @contextmanager
 def recording(home: Path, path: Path, *settings: str) -> Iterator[tuple[Daemon, Client]]:
-    """A daemon that records to ``path``, some lines of which are committed."""
+    """A daemon that records to ``path`` and has committed some lines."""
     daemon = Daemon(home, *settings)
     try:
         with daemon.client() as client:
@@ -47,14 +47,14 @@ def committed(status: Status) -> int:
 
 
 def waits(client: Client, text: str) -> Callable[[], bool]:
-    """What is waited for is told, as ``text``; meanwhile nothing is given up."""
+    """The pause is reported as ``text``, and nothing is abandoned during it."""
 
-    def told() -> bool:
+    def is_reported() -> bool:
         status = client.status()
         assert (status.state, status.fault) == (State.RECORDING, None)
         return re.search(text, status.waiting or "") is not None
 
-    return told
+    return is_reported
 
 
 def ended(client: Client) -> Status:
@@ -101,8 +101,8 @@ def test_a_recorder_that_pauses_for_seconds_is_waited_for(tmp_path: Path) -> Non
     check_books(status, found)
 
 
-def test_a_recorder_that_pauses_for_long_costs_no_recorded_line(tmp_path: Path) -> None:
-    """The recording ends where the rings were full, and goes on in a segment beside it."""
+def test_a_long_pause_of_the_recorder_loses_no_recorded_line(tmp_path: Path) -> None:
+    """The recording ends where the rings were full, and continues in a segment next to it."""
     path = tmp_path / "x.zarr"
     with recording(tmp_path, path, SHORT_RING) as (_, client):
         pid = client.status().processes["recorder"]
@@ -122,7 +122,7 @@ def test_a_recorder_that_pauses_for_long_costs_no_recorded_line(tmp_path: Path) 
 
 
 @pytest.mark.needs_freeze
-def test_a_disk_that_freezes_is_waited_for_and_the_recording_goes_on(tmp_path: Path) -> None:
+def test_a_frozen_disk_is_waited_for_and_the_recording_continues(tmp_path: Path) -> None:
     """Frozen once for as long as the rings hold, then for longer."""
     with frozen_disk.mounted(tmp_path) as disk:
         path = disk.path / "x.zarr"

@@ -157,7 +157,7 @@ def test_a_disk_that_ends_the_recording_is_a_fault(start: Start) -> None:
         assert client.disarm().state is State.IDLE
 
 
-def test_systemd_is_told(start: Start, tmp_path_factory: pytest.TempPathFactory) -> None:
+def test_systemd_is_notified(start: Start, tmp_path_factory: pytest.TempPathFactory) -> None:
     name = tmp_path_factory.mktemp("n") / "n"
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as receiver:
         receiver.bind(str(name))

@@ -56,14 +56,14 @@ def test_whole_life(daemon: Daemon) -> None:
     assert recording.first_line == begun["recording"]["first_line"]
     assert recording.attrs["run_id"] == begun["run_id"]
     assert recording.attrs["config"] == load_rig(daemon.config).model_dump(mode="json")
-    lines = daemon.log.read_text().splitlines()[logged:]  # a busy host is told in warnings
-    told = [line.split("INFO ")[1].split(" (")[0] for line in lines if "INFO " in line]
-    changes = [words for words in told if "→" in words]
+    lines = daemon.log.read_text().splitlines()[logged:]  # a busy host is reported in warnings
+    entries = [line.split("INFO ")[1].split(" (")[0] for line in lines if "INFO " in line]
+    changes = [words for words in entries if "→" in words]
     assert changes == ["idle → armed", "armed → recording", "recording → draining", "draining → armed"]
 
 
-def test_a_recording_goes_on_in_a_segment(daemon: Daemon) -> None:
-    """Another day, the same recording: what is there is not touched, the outage is told."""
+def test_a_recording_continues_in_a_segment(daemon: Daemon) -> None:
+    """Another day, the same recording: existing lines are not touched, and the outage is reported."""
     assert daemon("arm").code == 0
     for resume in ((), ("--resume",)):
         begun = daemon("start", "days.zarr", "--lines", 300, *resume, "--json")
@@ -194,7 +194,7 @@ def test_socket_is_private(daemon: Daemon) -> None:
     assert daemon.socket.stat().st_uid == os.geteuid()
 
 
-def test_wait_has_an_end(daemon: Daemon) -> None:
+def test_wait_has_a_time_limit(daemon: Daemon) -> None:
     answer = daemon("status", "--wait", "recording", "--timeout", 0.1)
     assert answer.code == 4
     assert "still idle" in answer.err

@@ -43,7 +43,7 @@ def hold(daemon: Daemon, count: int, stack: contextlib.ExitStack) -> None:
             connection.sendall(HALF_SENT if number % 2 else IDLE)
 
 
-def test_two_hundred_connections_keep_nobody_from_the_status(daemon: Daemon) -> None:
+def test_two_hundred_connections_do_not_block_the_status(daemon: Daemon) -> None:
     limit_descriptors(daemon, 128)
     with daemon.client() as client, contextlib.ExitStack() as stack:
         client.arm()
@@ -83,7 +83,7 @@ def test_status_is_answered_when_no_descriptor_is_left(daemon: Daemon) -> None:
     assert daemon.log.stat().st_size < MOST_LOG_BYTES
 
 
-def test_odd_entries_are_named_and_do_not_keep_the_daemon_from_ending(
+def test_odd_entries_are_reported_and_do_not_keep_the_daemon_from_ending(
     tmp_path_factory: pytest.TempPathFactory,
 ) -> None:
     home = tmp_path_factory.mktemp("d")

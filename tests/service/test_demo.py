@@ -91,7 +91,7 @@ def test_every_line_has_number_code_and_time_and_none_is_lost(demo: tuple[Path, 
     assert summary["capture"]["lost_lines"] == 0
 
 
-def test_the_reconstruction_is_good_and_the_papers_solver_stands_beside_it(
+def test_the_reconstruction_is_good_and_compared_with_the_papers_solver(
     demo: tuple[Path, dict[str, Any]],
 ) -> None:
     _, summary = demo
@@ -105,7 +105,7 @@ def test_the_reconstruction_is_good_and_the_papers_solver_stands_beside_it(
             assert abs(curve["measured_hz"] - set_hz[curve["name"]]) < 5
 
 
-def test_everything_is_left_where_it_was_asked_for(demo: tuple[Path, dict[str, Any]]) -> None:
+def test_all_files_are_in_the_requested_directory(demo: tuple[Path, dict[str, Any]]) -> None:
     out, summary = demo
     names = {path.name for path in out.iterdir()}
     assert {"index.html", "summary.json", "lines.png", "frames.png", "curves.png", "animation.webp"} <= names

@@ -91,7 +91,7 @@ def test_commands_of_a_user(tmp_path: Path) -> None:
     assert events["acquire start"].line == recording.first_line + 0.2 * LINE_RATE_HZ
 
 
-def test_lines_from_before_reconstruct_as_any_other(tmp_path: Path) -> None:
+def test_pre_trigger_lines_are_reconstructed_like_any_others(tmp_path: Path) -> None:
     """The same lines of the same scene, once recorded as they came and once taken back from the ring."""
     with serving(tmp_path) as service:
         service.arm()
@@ -117,7 +117,7 @@ def test_lines_from_before_reconstruct_as_any_other(tmp_path: Path) -> None:
     assert np.array_equal(*videos)
 
 
-def test_marks_record_again_and_again_without_being_armed_again(tmp_path: Path) -> None:
+def test_marks_start_recordings_repeatedly_without_arming_again(tmp_path: Path) -> None:
     events = {"sources": ["mark"], "pre_s": 0.2, "post_s": 0.1, "rearm": True}
     with serving(tmp_path, **{f"events.{key}": value for key, value in events.items()}) as service:
         service.arm()
@@ -142,11 +142,11 @@ def scene_with(home: Path, effect: str) -> str:
 
 
 def until_checked(service: Service) -> dict[str, tuple[str, int]]:
-    """Arm → verdict and shift, once both are told."""
+    """Arm → verdict and shift, once both are known."""
 
     def checks() -> dict[str, tuple[str, int]]:
         arms = service.status().arms
-        return {arm: (told.check.verdict, told.check.shift) for arm, told in arms.items() if told.check}
+        return {arm: (one.check.verdict, one.check.shift) for arm, one in arms.items() if one.check}
 
     def known() -> bool:
         return len(checks()) == 2 and all(verdict != "unknown" for verdict, _ in checks().values())
@@ -155,7 +155,7 @@ def until_checked(service: Service) -> dict[str, tuple[str, int]]:
     return checks()
 
 
-def test_light_that_comes_late_is_told_flagged_and_taints(tmp_path: Path) -> None:
+def test_late_light_is_reported_flagged_and_taints_the_recording(tmp_path: Path) -> None:
     scene = scene_with(tmp_path, 'kind = "code_errors"\nlate_substeps = 2')
     with serving(tmp_path, **{"simulation.scene": scene, "geometry.stages": 16}) as service:
         service.arm()
@@ -167,8 +167,8 @@ def test_light_that_comes_late_is_told_flagged_and_taints(tmp_path: Path) -> Non
         "TAINTED",
         "line budget reached",
     )
-    told = recording.attrs["ledger"]["tainted_by"]
-    assert told["code_contradicted_a"] == told["code_contradicted_b"] == 2000
+    tainted_by = recording.attrs["ledger"]["tainted_by"]
+    assert tainted_by["code_contradicted_a"] == tainted_by["code_contradicted_b"] == 2000
     for arm in "ab":
         assert np.all(recording.camera(arm).flags[:] & LineFlag.CODE_CONTRADICTED)
     assert [event.text for event in recording.events if event.kind == "code_check"] == [
@@ -208,7 +208,7 @@ def test_light_that_follows_the_code_is_verified_and_every_pulse_has_its_place(t
         assert camera["next_line"] >= 3000
 
 
-def test_a_level_that_is_crossed_records_by_itself(tmp_path: Path) -> None:
+def test_crossing_a_level_starts_a_recording(tmp_path: Path) -> None:
     """A chopper blade leaves the light free every now and then; recordings begin before it does."""
     scene = tmp_path / "scene.toml"
     text = (builtin_directory() / "scene-chopper.toml").read_text()

@@ -60,17 +60,17 @@ def test_the_daemon_records_the_lines_that_simulate_writes(
 
 
 def test_the_light_s_code_is_verified_through_the_fibre(recorded: Path) -> None:
-    told = [event.kind for event in open_recording(recorded).events if event.text == "verified"]
-    assert told == ["code_verified_a", "code_verified_b"]
+    kinds = [event.kind for event in open_recording(recorded).events if event.text == "verified"]
+    assert kinds == ["code_verified_a", "code_verified_b"]
 
 
 def test_commands_cope_with_lines_that_are_wider_than_the_sensor_has_stages(
     recorded: Path, tmp_path: Path
 ) -> None:
-    told = " ".join(acquire("info", recorded).out.split())  # lines are as long as the terminal is wide
+    output = " ".join(acquire("info", recorded).out.split())  # lines are as long as the terminal is wide
     assert (
         "32 x 48 fine pixels behind a fibre, 2 x 3 tiles of 16 x 16; 2 and 3 fibre bands on arms a and b"
-        in told
+        in output
     )
     assert acquire("verify", recorded).code == 0
     assert open_recording(recorded).overview("a").rows.shape[1] == 53

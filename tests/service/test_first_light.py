@@ -41,7 +41,7 @@ for line in Path("rig.toml").read_text().splitlines():
     lines.append(f"{line.split(' ')[0]} = {found[key]}" if key in found else line)
 Path("rig.toml").write_text("\\n".join(lines))
 """
-"""What a person does who is told the delays: they go into the rig file."""
+"""The step of a person: the reported delays go into the rig file."""
 DELAYS = (2.9e-6, 2.4e-6)
 """Of the practice instrument: the light behind cameras A and B."""
 
@@ -63,7 +63,7 @@ def script() -> str:
 
 
 @pytest.mark.timeout(600)
-def test_the_document_is_carried_out(tmp_path: Path) -> None:
+def test_every_command_of_the_document_works(tmp_path: Path) -> None:
     rig = (builtin_directory() / "rig-practice.toml").read_text(encoding="utf-8")
     for words, others in SMALLER.items():
         assert words in rig
@@ -82,8 +82,8 @@ def test_the_document_is_carried_out(tmp_path: Path) -> None:
         check=False,
     )
     assert done.returncode == 0, done.stdout + done.stderr
-    for told in ("the self-test passed", "turn 90", "DN per electron", "250 ms lit, 250 ms dark"):
-        assert told in done.stdout, told
+    for phrase in ("the self-test passed", "turn 90", "DN per electron", "250 ms lit, 250 ms dark"):
+        assert phrase in done.stdout, phrase
     known = open_calibration(tmp_path / "cal.zarr")
     assert list(known.steps) == ["delay", "dark", "linearity", "transfer", "flat", "orientation", "align"]
     late = known.quantities["light_late_ticks"]

@@ -18,7 +18,7 @@ LABORATORY = re.compile(rf"\| +((?:acquire\.(?:{OURS})|{OTHERS})\b[\w.]*)$", re.
 TRIGGER = 'trigger={driver="serial", url="/dev/acquire-no-such-port"}'
 
 
-def test_the_daemon_of_real_devices_imports_no_laboratory(tmp_path: Path) -> None:
+def test_the_daemon_for_real_devices_does_not_import_the_simulator(tmp_path: Path) -> None:
     """Served, armed in vain (there are no cameras), asked, ended: no simulator, no solver, no plots."""
     socket, log = tmp_path / "s" / "a.sock", tmp_path / "imports.txt"
     socket.parent.mkdir(mode=0o700)
@@ -39,9 +39,9 @@ def test_the_daemon_of_real_devices_imports_no_laboratory(tmp_path: Path) -> Non
         finally:
             daemon.send_signal(signal.SIGTERM)
             assert daemon.wait(120) == 0
-    told = log.read_text()
-    assert "acquire.daemon.service" in told, "the imports were not told"
-    assert LABORATORY.findall(told) == []
+    imported = log.read_text()
+    assert "acquire.daemon.service" in imported, "the imports were not logged"
+    assert LABORATORY.findall(imported) == []
 
 
 def _refusal(client: Client) -> str:

@@ -10,7 +10,7 @@ from tools.kill_storm import Storm
 
 
 @pytest.mark.parametrize("seed", [1, 2, 3])
-def test_nothing_that_was_acknowledged_is_lost(tmp_path: Path, seed: int) -> None:
+def test_no_acknowledged_line_is_lost(tmp_path: Path, seed: int) -> None:
     outcome = Storm(tmp_path, seed).run(4)
     assert outcome.faults == []
     assert outcome.killed.total() == 4

@@ -1,4 +1,4 @@
-"""Drivers of somebody else's under the real daemon: lines are recorded as their cameras gave them."""
+"""Third-party drivers under the real daemon: lines are recorded as their cameras delivered them."""
 
 from __future__ import annotations
 

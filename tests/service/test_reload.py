@@ -1,4 +1,4 @@
-"""The rig file changes while the real daemon records: what may change does, all else is refused in words."""
+"""The rig file changes while the real daemon records: allowed changes take effect, others are refused."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def daemon(tmp_path: Path) -> Iterator[Daemon]:
 
 
 def rewrite(daemon: Daemon, **replaced: str) -> None:
-    """The rig file, with lines of it replaced, or tables added under ``more``."""
+    """Rewrite the rig file with some lines replaced, or with the tables ``more`` added."""
     text = daemon.config.read_text()
     for key, value in replaced.items():
         if key == "more":
@@ -41,8 +41,8 @@ def rewrite(daemon: Daemon, **replaced: str) -> None:
     daemon.config.write_text(text)
 
 
-def told(client: Client) -> str:
-    """The latest news of a reload."""
+def news_of(client: Client) -> str:
+    """Return the latest news of a reload."""
     return [one.text for one in client.events(history=True, timeout_s=0) if one.kind == "reload"][-1]
 
 
@@ -50,7 +50,7 @@ def sentence(answer: Answer) -> str:
     return " ".join(answer.err.split())
 
 
-def test_what_may_change_does_and_the_recording_goes_on(daemon: Daemon, tmp_path: Path) -> None:
+def test_allowed_changes_take_effect_and_the_recording_continues(daemon: Daemon, tmp_path: Path) -> None:
     heard = tmp_path / "heard.jsonl"
     with daemon.client() as client:
         client.arm()
@@ -83,7 +83,7 @@ def test_what_may_change_does_and_the_recording_goes_on(daemon: Daemon, tmp_path
     assert noted in daemon.log.read_text()
 
 
-def test_what_cannot_change_is_refused_as_a_whole(daemon: Daemon) -> None:
+def test_a_reload_with_a_fixed_key_is_refused_as_a_whole(daemon: Daemon) -> None:
     with daemon.client() as client:
         client.arm()
         before = client.setup().config
@@ -102,14 +102,14 @@ def test_what_cannot_change_is_refused_as_a_whole(daemon: Daemon) -> None:
         assert "recording.retention" not in said.partition("possible:")[0]
         assert "restart the service when it is idle" in said
         assert client.setup().config == before
-        assert "nothing was changed: cannot change while the service works" in told(client)
+        assert "nothing was changed: cannot change while the service works" in news_of(client)
         assert client.status().state is State.ARMED
     refused = daemon("reload", "--json")
     assert refused.code == 2
     assert '"error"' in refused.out + refused.err
 
 
-def test_a_broken_file_changes_nothing_and_says_so(daemon: Daemon) -> None:
+def test_a_broken_file_changes_nothing_and_is_reported(daemon: Daemon) -> None:
     with daemon.client() as client:
         before = client.setup().config
         whole = daemon.config.read_text()
@@ -122,10 +122,10 @@ def test_a_broken_file_changes_nothing_and_says_so(daemon: Daemon) -> None:
             answer = daemon("reload")
             assert answer.code == 2
             assert why in sentence(answer)
-            assert why in told(client)
+            assert why in news_of(client)
         daemon.config.unlink()
         daemon.process.send_signal(signal.SIGHUP)
-        until(lambda: "does not exist" in told(client))
+        until(lambda: "does not exist" in news_of(client))
         assert client.setup().config == before
         assert client.status().state is State.IDLE
     assert "reload by SIGHUP: nothing was changed: " in daemon.log.read_text()
@@ -150,7 +150,7 @@ def test_sighup_reloads_the_page_and_the_log_level(daemon: Daemon) -> None:
         rewrite(daemon, more=f'[service]\nlog_level = "error"\n[web]\nport = {port}')
         daemon.process.send_signal(signal.SIGHUP)
         until(answers)
-        assert "reload by SIGHUP: service.log_level = 'error', it was 'info' (at once); web = " in told(
+        assert "reload by SIGHUP: service.log_level = 'error', it was 'info' (at once); web = " in news_of(
             client
         )
         length = daemon.log.stat().st_size
@@ -167,7 +167,7 @@ def test_sighup_reloads_the_page_and_the_log_level(daemon: Daemon) -> None:
 
 
 def test_a_terminal_that_is_closed_ends_its_daemon(tmp_path: Path) -> None:
-    """Nobody would hear of it any more; without a terminal, the same signal has the file read anew."""
+    """Nobody would see its messages; without a terminal, the same signal reloads the file."""
     terminal, end = os.openpty()
     log = tmp_path / "serve.log"
     with log.open("wb") as written:

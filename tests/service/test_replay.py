@@ -138,7 +138,7 @@ def test_gaps_and_flags_come_back_as_they_were_recorded(
     assert not any(long.iterdir())
 
 
-def test_a_recovered_recording_is_replayed_with_what_it_has_left(tmp_path: Path) -> None:
+def test_a_recovered_recording_is_replayed_with_its_remaining_lines(tmp_path: Path) -> None:
     path = hard_recording(tmp_path / "hard.zarr", {"a": [], "b": []}, seal=False)
     shard = path / "b" / "lines" / "c" / "1" / "0"
     data = bytearray(shard.read_bytes())
@@ -178,7 +178,7 @@ def test_a_recording_in_a_bucket_is_replayed(tmp_path: Path, server: S3Server) -
     replayed(url, "--out", tmp_path / "again.zarr", "--speed", 0)
 
 
-def test_a_recording_that_contradicts_itself_comes_out_different_by_array(
+def test_differences_of_an_inconsistent_recording_are_listed_by_array(
     tmp_path: Path,
 ) -> None:
     path = hard_recording(tmp_path / "wrong.zarr", wrong=True)
@@ -189,7 +189,7 @@ def test_a_recording_that_contradicts_itself_comes_out_different_by_array(
     assert "differs from" in json.loads(answer.err.splitlines()[-1])["error"]["message"]
 
 
-def test_what_cannot_be_replayed_is_refused_before_anything_is_made(tmp_path: Path) -> None:
+def test_impossible_replays_are_refused_before_anything_is_created(tmp_path: Path) -> None:
     path = hard_recording(tmp_path / "hard.zarr")
     for words, reason in (
         (("--loop",), "never end"),

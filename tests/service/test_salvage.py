@@ -1,4 +1,4 @@
-"""Processes of the real daemon are killed: every recording is sealed, and nobody had to say so."""
+"""Processes of the real daemon are killed: every recording is sealed without a command."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ KILLED = "recovered: its recorder was killed by SIGKILL"
 
 @pytest.fixture
 def start(tmp_path: Path) -> Iterator[Start]:
-    """Starts daemons in one directory, one after the other; all have ended after the test."""
+    """Start daemons in one directory, one after the other; all are ended after the test."""
     started: list[Daemon] = []
 
     def start_one() -> Daemon:
@@ -49,7 +49,7 @@ def committed(daemon: Daemon) -> int:
 
 
 def kill_recorder(daemon: Daemon) -> None:
-    """And wait until another records in its place."""
+    """Kill it, and wait until another records in its place."""
     with daemon.client() as client:
         before = client.status()
         assert before.recording is not None
@@ -72,7 +72,7 @@ def end_of(path: Path) -> tuple[str, str, str]:
 
 
 def kill_all(daemon: Daemon) -> None:
-    """The daemon and all that it started, at once."""
+    """Kill the daemon and all its processes at once."""
     family = [psutil.Process(daemon.process.pid), *daemon.children()]
     for process in family:
         process.suspend()  # so that none of them notices that another has gone
@@ -105,22 +105,22 @@ def test_a_recorder_is_killed_twice_and_a_stop_leaves_nothing_open(start: Start)
     assert "x-2.zarr recovered: " in daemon.log.read_text()
 
 
-def test_what_a_killed_daemon_left_is_sealed_by_the_next(start: Start) -> None:
+def test_the_recording_of_a_killed_daemon_is_sealed_by_the_next(start: Start) -> None:
     daemon = start()
     path = record(daemon)
-    told = committed(daemon)
+    acknowledged = committed(daemon)
     kill_all(daemon)
     assert end_of(path)[0] == "recording"
     again = start()
     until(lambda: end_of(path)[0] == "sealed")
     assert end_of(path) == ("sealed", "INTERRUPTED", "recovered: its writer ended without sealing it")
-    assert open_recording(path).lines >= told
+    assert open_recording(path).lines >= acknowledged
     assert verify(path).intact
     until(lambda: recovery(again, "x.zarr")[0] == "recovered")
 
 
-def test_what_another_process_writes_is_left_to_it(start: Start, tmp_path: Path) -> None:
-    """Here or on another machine: named, and not touched. What nobody writes is sealed."""
+def test_a_recording_that_another_process_writes_is_left_alone(start: Start, tmp_path: Path) -> None:
+    """On this or another machine: it is reported and not touched. A recording without a writer is sealed."""
     writer_script = Path(__file__).parents[1] / "store" / "writer_process.py"
     live, dead, far = (tmp_path / f"{name}.zarr" for name in ("live", "dead", "far"))
     command = [sys.executable, str(writer_script), str(live), "10000000", "0"]
@@ -148,24 +148,24 @@ def test_what_another_process_writes_is_left_to_it(start: Start, tmp_path: Path)
             writer.kill()
 
 
-def test_a_root_that_is_lost_under_the_recorder_costs_no_line(start: Start) -> None:
-    """Somebody deletes it, and then the recorder is killed: what was acknowledged is there in the end."""
+def test_deleting_the_root_during_recording_loses_no_line(start: Start) -> None:
+    """It is deleted, and then the recorder is killed: in the end all acknowledged lines are there."""
     daemon = start()
     path = record(daemon)
     with daemon.client() as client:
         recorder = psutil.Process(client.status().processes["recorder"])
     recorder.suspend()
-    told = committed(daemon)
+    acknowledged = committed(daemon)
     (path / "zarr.json").unlink()
     recorder.kill()
     assert daemon("stop").code == 0
     until(lambda: recovery(daemon, "x.zarr")[0] == "recovered")
-    assert open_recording(path).lines >= told > 0
+    assert open_recording(path).lines >= acknowledged > 0
     assert verify(path).intact
 
 
-def test_a_directory_that_is_lost_under_the_recorder_is_named(start: Start) -> None:
-    """As when its disk is unmounted: what was acknowledged is counted, and nothing is called recovered."""
+def test_deleting_the_directory_during_recording_is_reported(start: Start) -> None:
+    """As when its disk is unmounted: acknowledged lines are counted, and nothing is reported as recovered."""
     daemon = start()
     path = record(daemon)
     path.rename(daemon.home / "moved")
@@ -176,7 +176,7 @@ def test_a_directory_that_is_lost_under_the_recorder_is_named(start: Start) -> N
     assert "not sealed" in daemon("status").out
 
 
-def test_what_is_recorded_outside_the_directory_is_sealed_by_the_next_daemon(
+def test_recordings_outside_the_directory_are_sealed_by_the_next_daemon(
     start: Start, tmp_path_factory: pytest.TempPathFactory
 ) -> None:
     """Wherever it is, and whatever it is called."""

@@ -1,4 +1,4 @@
-"""A few cycles of `tools/soak.py`: faults by schedule, books to the line, nothing grows."""
+"""A few cycles of `tools/soak.py`: scheduled faults, complete ledgers, no growth."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from acquire.lines import ARMS
 from tools.soak import Soak, soak
 
 
-def test_every_line_has_a_fate_and_nothing_grows(tmp_path: Path) -> None:
+def test_every_line_is_accounted_for_and_memory_does_not_grow(tmp_path: Path) -> None:
     found = soak(tmp_path, 60_000, 10_000.0, seed=1)
     assert found.wrong == []
     assert found.segments >= found.cycles >= 2
@@ -16,11 +16,11 @@ def test_every_line_has_a_fate_and_nothing_grows(tmp_path: Path) -> None:
     (handles, threads), *_, (handles_end, threads_end) = found.usage
     assert (handles_end, threads_end) == (handles, threads)
     assert set(found.memory) == {"owner", "recorder", *ARMS}
-    assert "too short to tell" in str(found)
+    assert "too short to judge" in str(found)
     assert not any(tmp_path.iterdir())
 
 
-def test_what_grows_is_wrong_and_what_wanders_is_not() -> None:
+def test_steady_growth_is_a_defect_and_fluctuation_is_not() -> None:
     found = Soak()
     found.memory["steady"] = [(second, 80.0 + second % 3) for second in range(40)]
     found.memory["leaking"] = [(second, 80.0 + 0.2 * second) for second in range(40)]

@@ -97,7 +97,7 @@ def until_recording(supervisor: Supervisor, client: Client, life: int) -> Status
                 return status
 
 
-def test_killed_and_hung_it_comes_back_recovers_and_goes_on_recording(
+def test_a_killed_or_hanging_daemon_restarts_recovers_and_continues_recording(
     supervisor: Supervisor, tmp_path: Path
 ) -> None:
     client = Client(tmp_path / "c.sock")
@@ -126,7 +126,7 @@ def test_killed_and_hung_it_comes_back_recovers_and_goes_on_recording(
 
 @pytest.mark.needs_memory_group
 @pytest.mark.parametrize("victim", ["the kernel's choice", "daemon", "recorder", "a"])
-def test_out_of_memory_it_goes_on_recording(tmp_path: Path, victim: str) -> None:
+def test_recording_continues_after_the_kernel_kills_for_memory(tmp_path: Path, victim: str) -> None:
     """The kernel kills one of its processes: the daemon replaces a worker, the supervisor the daemon."""
     settings = ('service.begin="recording"', "service.retry_s=0.5")
     client = Client(tmp_path / "c.sock")
@@ -165,7 +165,7 @@ def test_out_of_memory_it_goes_on_recording(tmp_path: Path, victim: str) -> None
 
 
 def goes_on(client: Client, first: Status, without: set[int]) -> bool:
-    """More is recorded than at ``first``, and those who are gone are replaced."""
+    """More is recorded than at ``first``, and ended processes are replaced."""
     try:
         now = client.status()
     except AcquireError:

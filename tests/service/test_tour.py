@@ -1,4 +1,4 @@
-"""README.md's tour of five minutes: every block is carried out as it stands, in a fresh directory."""
+"""README.md's tour of five minutes: every block is executed unchanged in a fresh directory."""
 
 from __future__ import annotations
 
@@ -24,11 +24,11 @@ RESULT = "\nimport numpy\nnumpy.save('trusted.npy', video)\n"
 
 
 @pytest.mark.timeout(600)
-def test_the_tour_is_carried_out(tmp_path: Path) -> None:
+def test_every_command_of_the_tour_works(tmp_path: Path) -> None:
     assert [kind for kind, _ in STEPS] == ["sh", "sh", "sh", "python"]
     environment = os.environ | {
         "PATH": f"{Path(COMMAND[0]).parent}:{os.environ['PATH']}",
-        "XDG_RUNTIME_DIR": str(tmp_path),  # where the service listens when it is told nothing
+        "XDG_RUNTIME_DIR": str(tmp_path),  # where the service listens by default
     }
     environment.pop("ACQUIRE_SOCKET", None)
     said = ""

@@ -1,4 +1,4 @@
-"""The real daemon copies what it records to a real S3 server, which goes away, is slow, or says no."""
+"""The real daemon copies what it records to a real S3 server, which disappears, is slow, or refuses."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def server() -> Iterator[S3Server]:
 
 
 class Lab:
-    """Daemons in one directory, one after the other, and the place that they copy to."""
+    """Daemons in one directory, one after the other, and the target of their copies."""
 
     def __init__(self, home: Path, server: S3Server) -> None:
         self.home = home
@@ -104,7 +104,7 @@ def files(path: Path) -> dict[str, bytes]:
 
 
 def check_copy(there: Path, here: Path) -> None:
-    """The same recording, to the byte."""
+    """Check that the copy is identical to the byte."""
     assert files(there) == files(here)
     assert open_recording(there).info() | {"path": "", "bytes": 0} == open_recording(here).info() | {
         "path": "",
@@ -113,7 +113,7 @@ def check_copy(there: Path, here: Path) -> None:
     assert verify(there).intact
 
 
-def test_a_server_goes_away_and_comes_back_and_nobody_waits(lab: Lab, tmp_path: Path) -> None:
+def test_a_server_that_disappears_and_returns_delays_nobody(lab: Lab, tmp_path: Path) -> None:
     daemon = lab.start()
     path = record(daemon)
     until(lambda: upload(daemon).lines >= SHARD_LINES)  # while it grows
@@ -134,7 +134,7 @@ def test_a_server_goes_away_and_comes_back_and_nobody_waits(lab: Lab, tmp_path: 
     assert daemon.end() == 0
 
 
-def test_a_killed_daemon_and_recorder_and_all_of_it_arrives(lab: Lab, tmp_path: Path) -> None:
+def test_everything_is_uploaded_although_daemon_and_recorder_are_killed(lab: Lab, tmp_path: Path) -> None:
     daemon = lab.start()
     first = record(daemon)
     until(lambda: upload(daemon).lines >= SHARD_LINES)
@@ -195,7 +195,7 @@ def test_a_store_that_hangs_does_not_keep_the_daemon_from_ending(lab: Lab, tmp_p
     check_copy(lab.download(tmp_path / "far") / "x.zarr", path)
 
 
-def test_a_store_that_says_no_is_refused_and_one_that_is_away_is_a_warning(lab: Lab) -> None:
+def test_a_refusing_store_is_an_error_and_an_unreachable_one_a_warning(lab: Lab) -> None:
     daemon = lab.start()
     place = f"s3://{BUCKET}/{lab.prefix}"
     lab.server.denies = True

@@ -20,7 +20,7 @@ def _locks_of_its_own(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pyt
 
 @pytest.fixture
 def locks_of_the_host(_locks_of_its_own: None, monkeypatch: pytest.MonkeyPatch) -> None:
-    """For tests in which another process shall find the lock."""
+    """For tests in which another process must find the lock."""
     monkeypatch.setattr(lock, "SHARED", SHARED)
 
 

@@ -1,4 +1,4 @@
-"""A USB bus of this process: what pyusb asks of a backend, without hardware and without libusb."""
+"""A USB bus within this process: a backend for pyusb without hardware and libusb."""
 
 from __future__ import annotations
 
@@ -91,7 +91,7 @@ class FakeBus(usb.backend.IBackend):
         return 1
 
     def _refuse(self, *reasons: int) -> None:
-        """As libusb does: who has no right may not open; what another has cannot be claimed."""
+        """Refuse as libusb does: without permission to open, or to claim a device in use."""
         if self.refusal in reasons:
             raise usb.core.USBError(os.strerror(self.refusal), None, self.refusal)
 

@@ -14,7 +14,7 @@ from acquire.trigger.registers import PRBS_SEED, FrameType
 
 
 class Damage(NamedTuple):
-    """What a storm has done."""
+    """Result of a storm."""
 
     wrong: int
     """Values that are not what was written."""
@@ -23,7 +23,7 @@ class Damage(NamedTuple):
 
 
 class NoisyTransport(TwinTransport):
-    """Each byte, either way, is changed or dropped or doubled with ``rate``."""
+    """Change, drop or double each byte in both directions with probability ``rate``."""
 
     def __init__(self, twin: Twin, rate: float, seed: int) -> None:
         super().__init__(twin, "noisy link")
@@ -51,7 +51,7 @@ class NoisyTransport(TwinTransport):
 
 
 class DeafTransport:
-    """Takes everything, says nothing; `hang_up` ends it."""
+    """Accept everything and send nothing; `hang_up` ends it."""
 
     name = "deaf"
     bytes_per_s = float("inf")

@@ -1,6 +1,6 @@
-"""A client of the trigger, written from PROTOCOL.md and REGISTERS.md alone: it imports nothing of ours.
+"""A client of the trigger, written from PROTOCOL.md and REGISTERS.md alone: it imports none of our modules.
 
-Every number comes from the tables of the two documents; what is code here is what they say in words.
+Every number comes from the tables of the two documents; the code here implements their text.
 """
 
 from __future__ import annotations
@@ -59,7 +59,7 @@ class Register(NamedTuple):
 
 
 class Documents:
-    """What the documents' tables say."""
+    """Contents of the documents' tables."""
 
     def __init__(self, folder: Path) -> None:
         self.tables = tables(folder / "PROTOCOL.md")
@@ -96,7 +96,7 @@ class Refused(Exception):
 
 
 class Client:
-    """One device at a port. Tags are put aside in ``tags``, with the sequence of their frame."""
+    """One device at a port. Tags are collected in ``tags``, with the sequence of their frame."""
 
     def __init__(self, port: str, documents: Documents) -> None:
         self.documents = documents
@@ -138,7 +138,7 @@ class Client:
         return kind, sequence, body[4:]
 
     def hear(self) -> tuple[int, int, bytes]:
-        """As `_next`; a tag is put aside as well."""
+        """As `_next`; a tag is collected as well."""
         kind, sequence, payload = self._next()
         if kind == self.types["TAG"]:
             places = self.documents.tag.items()

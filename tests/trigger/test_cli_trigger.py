@@ -62,7 +62,7 @@ def test_a_run_by_hand(port: str) -> None:
     assert "no run is armed" in acquire("monitor", "--url", port, code=5)
 
 
-def test_a_run_that_the_host_leaves_alone_ends(port: str) -> None:
+def test_a_run_without_host_requests_ends(port: str) -> None:
     started = json.loads(
         acquire("arm", "--url", port, "--json", "--start", "--set", "trigger.watchdog_s=1e-3")
     )

@@ -1,4 +1,4 @@
-"""The link's requests and answers, without a link: bytes and times are what the test says that they are."""
+"""The link's requests and answers, without a link: the test chooses bytes and times."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ FATES = {
 
 
 class World:
-    """A dialogue, a device that does to each request what its fate says, and a clock that jumps."""
+    """A dialogue, a device that treats each request according to its fate, and a clock that jumps."""
 
     def __init__(self, fates, now_s: float = -1000.0, window_bytes: int = 1024) -> None:
         self.dialogue = Dialogue("way", math.inf, REPLY_S, ATTEMPTS)
@@ -95,7 +95,7 @@ class World:
         heapq.heappush(self._coming, (at_s, next(self._order), data))
 
     def step(self) -> None:
-        """To the next thing that comes, or the deadline, whichever is first."""
+        """Advance to the next arrival or the deadline, whichever is first."""
         self.send()
         arrival_s = self._coming[0][0] if self._coming else math.inf
         self.now_s = min(arrival_s, self.dialogue.deadline_s)
@@ -109,7 +109,7 @@ class World:
             self.step()
 
     def rest(self) -> None:
-        """What still comes when nobody waits any more."""
+        """Deliver everything that arrives after the last wait."""
         while self._coming:
             at_s, _, data = heapq.heappop(self._coming)
             self.dialogue.receive(data, at_s)
@@ -141,7 +141,7 @@ ONE_REQUEST = {
 
 
 @pytest.mark.parametrize("fates", ONE_REQUEST, ids=", ".join)
-def test_one_request_has_its_answer_whatever_became_of_its_attempts(fates) -> None:
+def test_a_request_gets_its_answer_whatever_happened_to_its_attempts(fates) -> None:
     at_s, attempts, counts = ONE_REQUEST[fates]
     world = World(fates)
     calls = world.dialogue.ask(reads([7]))
@@ -191,7 +191,7 @@ FIVE_REQUESTS = {
 
 
 @pytest.mark.parametrize("which", FIVE_REQUESTS)
-def test_an_answer_to_a_later_request_tells_of_a_loss_at_once(which) -> None:
+def test_an_answer_to_a_later_request_reveals_a_loss_at_once(which) -> None:
     at_s, counts = FIVE_REQUESTS[which]
     world = World(["lost" if k == which else "answered" for k in range(5)])
     calls = world.dialogue.ask(reads(range(5)))
@@ -221,7 +221,7 @@ def test_a_request_larger_than_the_window_goes_alone() -> None:
     assert world.elapsed_s == pytest.approx(3 * DELAY_S)
 
 
-def test_while_answers_come_none_is_sent_again() -> None:
+def test_no_request_is_repeated_while_answers_arrive() -> None:
     """As over a slow line: the last of many is answered long after its request could have timed out."""
     world = World(["lost"] * 10)
     calls = world.dialogue.ask(reads(range(10)))
@@ -233,7 +233,7 @@ def test_while_answers_come_none_is_sent_again() -> None:
     assert world.dialogue.longest_s == pytest.approx(9.0)
 
 
-def test_a_host_that_was_stopped_makes_all_its_attempts_and_waits_for_the_last_answer() -> None:
+def test_a_paused_host_makes_all_its_attempts_and_waits_for_the_last_answer() -> None:
     dialogue = Dialogue("way", math.inf, REPLY_S, ATTEMPTS)
     (call,) = dialogue.ask(reads([7]))
     for attempt in range(ATTEMPTS):
@@ -258,7 +258,7 @@ def test_answers_to_others_do_not_keep_a_last_attempt_waiting_beyond_its_limit()
     assert world.dialogue.deadline_s == world.dialogue.limit_s == 3 * REPLY_S
 
 
-def test_what_nobody_waits_for_any_more_makes_room_and_its_answer_is_counted() -> None:
+def test_an_abandoned_request_makes_room_and_its_answer_is_counted() -> None:
     world = World(["answered"] * 3, window_bytes=2 * READ_BYTES)
     mine, others = world.dialogue.ask(reads(range(3))), world.dialogue.ask(reads([9]))
     world.send()
@@ -270,14 +270,14 @@ def test_what_nobody_waits_for_any_more_makes_room_and_its_answer_is_counted() -
     assert world.dialogue.to_send(world.now_s) == b""
 
 
-def test_what_fits_no_frame_is_refused_before_anything_is_queued() -> None:
+def test_a_request_too_large_for_a_frame_is_refused_before_anything_is_queued() -> None:
     dialogue = Dialogue("way", math.inf, REPLY_S, ATTEMPTS)
     with pytest.raises(FrameLengthError):
         dialogue.ask([*reads([1]), (FrameType.WRITE, bytes(MAX_PAYLOAD + 1))])
     assert dialogue.to_send(0.0) == b""
 
 
-def test_a_slow_way_is_given_more_time() -> None:
+def test_a_slow_link_is_given_more_time() -> None:
     dialogue = Dialogue("way", 100.0, REPLY_S, ATTEMPTS)
     assert dialogue.reply_s == REPLY_S + 2 * (MAX_ENCODED + 1) / 100
     dialogue.ask(reads([1]))
@@ -285,7 +285,7 @@ def test_a_slow_way_is_given_more_time() -> None:
     assert dialogue.deadline_s == 5.0 + dialogue.reply_s
 
 
-def test_tags_come_between_answers_and_are_nobodys() -> None:
+def test_tags_between_answers_belong_to_no_request() -> None:
     world = World([])
     calls = world.dialogue.ask(reads([1]))
     (request,) = Decoder().feed(world.dialogue.to_send(0.0))

@@ -59,7 +59,7 @@ def test_requests_are_pipelined_as_far_as_the_window_goes() -> None:
     assert [frame.sequence for frame in sent] == list(range(len(sent)))
 
 
-def test_a_dead_link_fails_every_waiter_at_once_and_whoever_comes_later() -> None:
+def test_a_dead_link_fails_every_present_and_later_waiter_at_once() -> None:
     deaf = DeafTransport()
     with linked(deaf, reply_s=20, attempts=3) as link:
         told: list[str] = []
@@ -103,7 +103,7 @@ def test_closing_ends_a_wait() -> None:
 
 
 class Scripted(DeafTransport):
-    """Answers each request by what the script makes of it."""
+    """Device that answers each request with the result of a script."""
 
     def __init__(self, script) -> None:
         super().__init__()
@@ -129,7 +129,7 @@ def test_a_device_of_another_protocol_is_named_with_both_versions() -> None:
         link.read(0)
 
 
-def test_answers_of_others_are_not_taken() -> None:
+def test_answers_to_others_are_not_taken() -> None:
     def answer(frame):
         if frame.sequence == 0:
             stranger = Frame(FrameType.DATA, 0, read_payload(1, 1) + b"\0\0\0")
@@ -153,7 +153,7 @@ def test_a_refusal_carries_its_reason_through_a_pickle() -> None:
     )
 
 
-def test_tags_have_a_bound_and_what_exceeds_it_is_counted(monkeypatch) -> None:
+def test_the_queue_of_tags_is_bounded_and_the_excess_is_counted(monkeypatch) -> None:
     monkeypatch.setattr("acquire.trigger.link._TAGS_KEPT", 10)
     transport = Scripted(lambda frame: [])
     tags = [Frame(FrameType.TAG, k, r.pack_tag(r.TagRecord(1, k, 3 * k, k, 1))) for k in range(25)]
@@ -190,7 +190,7 @@ def test_callers_in_many_threads_get_their_own_answers_on_a_bad_link() -> None:
     ]
 
 
-def test_while_answers_come_a_late_one_is_waited_for_and_not_asked_for_again() -> None:
+def test_a_late_answer_is_awaited_without_repetition_while_others_arrive() -> None:
     transport = Scripted(lambda frame: [])
     with linked(transport, reply_s=1.0, attempts=5) as link:
         link.window_bytes = 200
@@ -209,7 +209,7 @@ def _answer_slowly(transport: Scripted, count: int) -> None:
         transport.out += encode(Frame(FrameType.DATA, sequence, write_payload(0, [1])))
 
 
-def test_a_slow_way_is_given_more_time() -> None:
+def test_a_slow_link_is_given_more_time() -> None:
     deaf = DeafTransport()
     deaf.bytes_per_s = 960.0
     with linked(deaf, reply_s=0.1, attempts=2) as link:

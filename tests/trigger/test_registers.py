@@ -53,7 +53,7 @@ def test_fields_by_name() -> None:
         r.SUBSTEP_CLOCKS.to_words(1 << 24)
 
 
-def test_the_checksum_sees_a_changed_address_and_no_changed_word_of_explanation(monkeypatch) -> None:
+def test_the_checksum_depends_on_addresses_and_not_on_explanations(monkeypatch) -> None:
     from dataclasses import replace
 
     def with_first(**changes):

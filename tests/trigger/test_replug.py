@@ -1,4 +1,4 @@
-"""A cable pulled in the middle of a run, and put back: over a real pseudo-terminal with a name of its own."""
+"""A cable pulled in the middle of a run, and put back: over a real pseudo-terminal with a fixed name."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from acquire.trigger.transports.serial import SerialTransport
 
 
 class Cable:
-    """A port whose name stays while what is behind it comes and goes."""
+    """A port with a constant name whose device appears and disappears."""
 
     def __init__(self, port: Path, model: TriggerModel) -> None:
         self.port, self.model = port, model
@@ -73,7 +73,7 @@ def tags_for_ever(driver: TriggerDriver) -> None:
         driver.tags(5.0)
 
 
-def test_a_driver_without_its_device_tells_what_it_knows(cable, driver) -> None:
+def test_a_driver_without_its_device_reports_the_last_known_state(cable, driver) -> None:
     lose_it(cable, driver)
     statistics = driver.statistics()
     assert statistics["pulses"] > 100
@@ -86,7 +86,7 @@ def test_a_driver_without_its_device_tells_what_it_knows(cable, driver) -> None:
         driver.reopen()
 
 
-def test_a_run_goes_on_without_its_host_and_is_found_again(cable, driver) -> None:
+def test_a_run_continues_without_its_host_and_is_found_again(cable, driver) -> None:
     lose_it(cable, driver)
     known = driver.statistics()["pulses"]
     cable.plug()
@@ -103,7 +103,7 @@ def test_a_run_goes_on_without_its_host_and_is_found_again(cable, driver) -> Non
     assert now["tags"] + now["tags_missing"] == now["tag_count"], "those of the time without a cable"
 
 
-def test_a_run_that_ended_meanwhile_says_why(cable) -> None:
+def test_a_run_that_ended_in_the_meantime_reports_the_reason(cable) -> None:
     driver = cable.driver(watchdog_s=0.05)
     lose_it(cable, driver)
     cable.plug()
@@ -116,7 +116,7 @@ def test_a_run_that_ended_meanwhile_says_why(cable) -> None:
     driver.close()
 
 
-def test_a_stop_that_did_not_reach_the_device_is_made_up_for(cable, driver) -> None:
+def test_a_stop_that_did_not_reach_the_device_is_repeated(cable, driver) -> None:
     lose_it(cable, driver)
     with pytest.raises(TriggerError, match="is not there"):
         driver.stop()
@@ -127,14 +127,14 @@ def test_a_stop_that_did_not_reach_the_device_is_made_up_for(cable, driver) -> N
     assert driver.tags(5.0)[0].line == 0
 
 
-def test_a_stop_connects_again_to_put_out_the_light(cable, driver) -> None:
+def test_a_stop_connects_again_to_switch_the_light_off(cable, driver) -> None:
     lose_it(cable, driver)
     cable.plug()
     assert driver.stop() > 100
     assert driver.device().status().state == State.ENDED
 
 
-def test_a_run_that_nobody_here_asked_to_end_is_not_ended(cable, driver) -> None:
+def test_a_run_is_not_ended_without_a_request(cable, driver) -> None:
     lose_it(cable, driver)
     cable.plug()
     with pytest.raises(TriggerError, match=r"while another one runs: number 0x.* is running with \d+"):

@@ -44,7 +44,7 @@ def test_ports_are_listed_with_who_uses_them(monkeypatch: pytest.MonkeyPatch) ->
         twin.close()
 
 
-def test_a_port_that_is_not_there_is_named() -> None:
+def test_a_missing_port_is_named() -> None:
     with pytest.raises(TriggerError, match=r"/dev/ttyNONE is not there; possible: .*; try: check cable"):
         SerialTransport("/dev/ttyNONE", 3_000_000)
     with pytest.raises(TriggerError, match="nonsense://x cannot be opened"):
@@ -62,7 +62,7 @@ def test_a_port_that_may_not_be_opened_leads_to_the_udev_rule(monkeypatch) -> No
         SerialTransport("/dev/ttyUSB0", 3_000_000)
 
 
-def test_an_echo_is_no_trigger() -> None:
+def test_an_echo_is_not_taken_for_a_trigger() -> None:
     driver = TriggerDriver(lambda: SerialTransport("loop://", 3_000_000), TriggerConfig())
     begun = time.monotonic()
     with pytest.raises(TriggerError, match=r"loop://: no answer to READ .*try: is it the trigger's port"):
@@ -78,7 +78,7 @@ def _hold(path, link) -> None:
 
 
 @pytest.mark.usefixtures("locks_of_the_host")
-def test_a_port_has_one_user_and_the_second_hears_who_the_first_is(tmp_path) -> None:
+def test_a_port_has_one_user_and_the_error_names_it_to_the_second(tmp_path) -> None:
     path = str(tmp_path / "tty")
     context = multiprocessing.get_context("spawn")
     ours, theirs = context.Pipe()
@@ -105,7 +105,7 @@ def test_two_drivers_on_one_port() -> None:
         twin.close()
 
 
-def test_a_port_that_goes_away_is_told() -> None:
+def test_a_disappearing_port_is_reported() -> None:
     with wired_model() as model:
         twin = PtyTwin(model)
         port = SerialTransport(twin.path, 3_000_000)
@@ -138,7 +138,7 @@ def test_tags_that_nobody_takes_are_lost_by_the_device_and_counted(monkeypatch) 
 
 
 class _Stalling:
-    """A host that now and then does not read."""
+    """A host that sometimes does not read."""
 
     name = "stalling"
     bytes_per_s = float("inf")
@@ -158,7 +158,7 @@ class _Stalling:
 
 
 class Talker:
-    """Has more to say than a pseudo-terminal holds."""
+    """Device that sends more than a pseudo-terminal holds."""
 
     busy = False
 
@@ -166,7 +166,7 @@ class Talker:
         self.rest = bytes(k % 251 for k in range(100_000))
 
     def feed(self, data: bytes) -> None:
-        """Listens to nothing."""
+        """Ignore all input."""
 
     def take(self) -> bytes:
         data, self.rest = self.rest, b""

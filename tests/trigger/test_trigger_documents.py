@@ -41,7 +41,7 @@ def refused(client: Client, name: str, run: int = 0) -> str:
     return names[caught.value.error]
 
 
-def test_the_client_knows_nothing_but_the_documents() -> None:
+def test_the_client_uses_only_the_documents() -> None:
     tree = ast.parse(Path(paper_client.__file__).read_text(encoding="utf-8"))
     imported = [node for node in ast.walk(tree) if isinstance(node, ast.Import | ast.ImportFrom)]
     names = [
@@ -146,7 +146,7 @@ def test_a_run_that_is_stopped_before_it_starts_has_a_last_tag(client: Client) -
     assert client.read("START_TIME") == 0
 
 
-def test_what_the_documents_say_of_the_map_s_end_and_of_words_that_are_too_wide(client: Client) -> None:
+def test_the_documented_end_of_the_map_and_words_that_are_too_wide(client: Client) -> None:
     errors = DOCUMENTS.numbers("Errors")
 
     def refusal(words: list[int] | int, address: int) -> tuple[int, int]:
@@ -182,7 +182,7 @@ def test_what_the_documents_say_of_the_map_s_end_and_of_words_that_are_too_wide(
 
 
 @pytest.mark.parametrize("data", [b"", b"a", bytes(3), bytes(range(256)) * 3, b"x" * 254, b"x" * 508 + b"\0"])
-def test_the_client_s_cobs_is_everybody_s(data: bytes) -> None:
+def test_the_client_s_cobs_agrees_with_the_package(data: bytes) -> None:
     from cobs import cobs
 
     assert paper_client.unstuffed(cobs.encode(data)) == data

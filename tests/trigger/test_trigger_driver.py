@@ -27,7 +27,7 @@ def driver_of(twin, **settings) -> TriggerDriver:
     return TriggerDriver(lambda: TwinTransport(twin), TriggerConfig(**settings))
 
 
-def test_a_run_survives_an_unplugged_cable_and_its_state_is_told() -> None:
+def test_a_run_survives_an_unplugged_cable_and_its_state_is_reported() -> None:
     with wired_model() as model:
         driver = driver_of(model)
         driver.prepare(run())
@@ -46,7 +46,7 @@ def test_a_run_survives_an_unplugged_cable_and_its_state_is_told() -> None:
         driver.close()
 
 
-def test_a_device_that_was_restarted_meanwhile_is_found_out() -> None:
+def test_a_restarted_device_is_detected() -> None:
     with wired_model() as model, wired_model() as fresh:
         twins = [model, fresh]
         driver = TriggerDriver(lambda: TwinTransport(twins.pop(0)), TriggerConfig())
@@ -57,7 +57,7 @@ def test_a_device_that_was_restarted_meanwhile_is_found_out() -> None:
         driver.close()
 
 
-def test_a_run_of_another_program_is_found_out() -> None:
+def test_a_run_of_another_program_is_detected() -> None:
     with wired_model() as model:
         driver, other = driver_of(model), driver_of(model)
         driver.prepare(run())
@@ -101,7 +101,7 @@ def test_a_mismatch_names_both_sides(register, value, words) -> None:
         driver.close()
 
 
-def test_what_does_not_read_back_is_an_error() -> None:
+def test_a_setting_that_does_not_read_back_is_an_error() -> None:
     with wired_model() as model:
         driver = driver_of(model, light={"open_ticks": 100})
         kept = model.registers._write_register
@@ -174,7 +174,7 @@ def test_simulated_time_runs_fast_and_the_fit_holds_at_the_start() -> None:
     wire.close()
 
 
-def test_the_wire_carries_what_the_registers_say() -> None:
+def test_the_wire_carries_the_settings_of_the_registers() -> None:
     wire = Wire()
     driver = driver_of(TriggerModel(wire, CLOCK_HZ))
     driver.prepare(run())
@@ -212,7 +212,7 @@ def test_a_stop_ends_the_wait_for_an_external_start() -> None:
         driver.close()
 
 
-def test_who_waits_for_tags_shows_life_however_rare_they_are() -> None:
+def test_waiting_for_tags_feeds_the_watchdog_however_rare_they_are() -> None:
     with wired_model() as model:
         driver = driver_of(model, watchdog_s=3.0)
         driver.prepare(run(tag_every_lines=60_000))

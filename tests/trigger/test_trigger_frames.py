@@ -71,7 +71,7 @@ def test_damaged_bytes_give_no_wrong_frame_and_cost_only_their_neighbours(sent, 
 
 @given(st.binary(max_size=2000), frames, cuts)
 @example(b"\1" * 1999, Frame(1, 2, b"x"), [])
-def test_after_any_rubbish_the_next_zero_is_a_new_beginning(rubbish, frame, lengths) -> None:
+def test_after_any_garbage_the_next_zero_resynchronises(rubbish, frame, lengths) -> None:
     decoder = Decoder()
     data = rubbish + b"\0" + encode(frame)
     assert [f for piece in pieces(data, lengths) for f in decoder.feed(piece)][-1:] == [frame]
@@ -79,7 +79,7 @@ def test_after_any_rubbish_the_next_zero_is_a_new_beginning(rubbish, frame, leng
 
 
 @given(frames, st.data())
-def test_a_frame_cut_short_is_nothing(frame, data) -> None:
+def test_a_truncated_frame_is_ignored(frame, data) -> None:
     encoded = encode(frame)
     cut = data.draw(st.integers(0, len(encoded) - 2))
     decoder = Decoder()
@@ -87,7 +87,7 @@ def test_a_frame_cut_short_is_nothing(frame, data) -> None:
     assert decoder.faults.total() == (cut > 0)
 
 
-def test_every_fault_has_its_name() -> None:
+def test_every_defect_is_named() -> None:
     with pytest.raises(FrameLengthError, match="9 to 249"):
         decode(b"123")
     with pytest.raises(FrameLengthError):
@@ -119,7 +119,7 @@ def test_payloads(address, values) -> None:
 
 
 @given(st.binary(max_size=12))
-def test_payloads_of_no_use_are_named(payload) -> None:
+def test_invalid_payloads_are_named(payload) -> None:
     for parse in (parse_read, parse_write, parse_nak):
         try:
             parse(payload)
@@ -127,7 +127,7 @@ def test_payloads_of_no_use_are_named(payload) -> None:
             continue
 
 
-def test_an_answer_belongs_to_its_request_or_is_none() -> None:
+def test_an_answer_must_match_its_request() -> None:
     request = Frame(FrameType.READ, 5, read_payload(0x10, 2))
     good = Frame(FrameType.DATA, 5, write_payload(0x10, [1, 2]))
     assert answers(request, good)
@@ -151,7 +151,7 @@ def test_an_answer_belongs_to_its_request_or_is_none() -> None:
         flags=st.integers(0, 2**16 - 1),
     )
 )
-def test_tags_are_packed_as_their_table_says(tag) -> None:
+def test_tags_are_packed_according_to_their_table(tag) -> None:
     payload = r.pack_tag(tag)
     assert r.unpack_tag(payload) == tag
     at = 0

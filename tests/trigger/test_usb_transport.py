@@ -13,7 +13,7 @@ from acquire.trigger.driver import TriggerDriver
 from acquire.trigger.transports.usb import FoundDevice, UsbTransport, list_devices
 
 
-def test_the_driver_runs_over_usb_and_hears_of_an_unplugged_cable() -> None:
+def test_the_driver_runs_over_usb_and_reports_an_unplugged_cable() -> None:
     with wired_model() as model:
         bus = FakeBus(model)
         driver = TriggerDriver(lambda: UsbTransport(serial="42", backend=bus), TriggerConfig())
@@ -31,7 +31,7 @@ def test_the_driver_runs_over_usb_and_hears_of_an_unplugged_cable() -> None:
         assert bus.claimed == 0
 
 
-def test_a_usb_device_that_is_not_there_is_told_with_those_that_are() -> None:
+def test_a_missing_usb_device_is_reported_with_those_present() -> None:
     with wired_model() as model:
         with pytest.raises(TriggerError, match="usb 1209:0001 7 is not on the bus; possible: 42"):
             UsbTransport(serial="7", backend=FakeBus(model))
@@ -43,7 +43,7 @@ def test_a_usb_device_that_is_not_there_is_told_with_those_that_are() -> None:
 @pytest.mark.parametrize(
     ("refusal", "hint"), [(errno.EACCES, "udev rule"), (errno.EBUSY, "another program"), (errno.EIO, "cable")]
 )
-def test_a_device_that_may_not_be_opened_says_what_to_try(refusal, hint) -> None:
+def test_a_device_without_permission_suggests_a_remedy(refusal, hint) -> None:
     with wired_model() as model:
         bus = FakeBus(model)
         bus.refusal = refusal
@@ -53,7 +53,7 @@ def test_a_device_that_may_not_be_opened_says_what_to_try(refusal, hint) -> None
         UsbTransport(backend=bus).close()  # the lock was let go
 
 
-def test_triggers_on_the_bus_are_listed_and_what_keeps_us_from_them_said(monkeypatch) -> None:
+def test_triggers_on_the_bus_are_listed_with_obstacles(monkeypatch) -> None:
     with wired_model() as model:
         bus = FakeBus(model)
         assert list_devices(bus) == [FoundDevice("usb 1209:0001", "42", "")]

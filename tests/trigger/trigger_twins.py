@@ -1,4 +1,4 @@
-"""Twins of the trigger's device, as the contract's tests want them. A new twin is one more entry in TWINS.
+"""Twins of the trigger's device, for the tests of the contract. A new twin is one more entry in TWINS.
 
 Each entry is a context manager that gives a `Bench`. ``speed`` says how many of its line periods of 30 µs
 (3 sub-steps of 900 ticks at 90 MHz) it issues per line period of the host's time.
@@ -39,7 +39,7 @@ CODE = PrbsCode.from_seed(64, 3)
 
 @dataclass
 class Bench:
-    """A device, the way to it, and how to pull its plug."""
+    """A device, its link, and a way to unplug it."""
 
     connect: Callable[[], Transport]
     unplug: Callable[[], None]

@@ -36,21 +36,17 @@ class AravisFeatures:
         self._library, self._device = library, device
 
     def find(self, name: str) -> AravisNode | None:
-        node = self._library.arv_device_get_feature(self._device, name.encode())
-        kind = self._kind(node) if node else None
-        return AravisNode(self._library, self._device, node, name, kind) if kind else None
-
-    def _kind(self, node: int) -> Kind | None:
-        """Return how the node is read and written; None for a category."""
         library = self._library
-        if self._is_category(node):
+        node = library.arv_device_get_feature(self._device, name.encode())
+        if not node or self._is_category(node):
             return None
-        kinds = (
+        # The kind determines how the node is read and written.
+        kinds: Iterator[Kind] = (
             kind
             for name, kind in _KINDS
             if (known := library.g_type_from_name(name)) and library.g_type_check_instance_is_a(node, known)
         )
-        return next(kinds, "other")
+        return AravisNode(library, self._device, node, name, next(kinds, "other"))
 
     def _is_category(self, node: int) -> bool:
         return bool(self._library.g_type_name_from_instance(node) == b"ArvGcCategory")
@@ -112,7 +108,7 @@ class AravisNode:
 
     @property
     def selected(self) -> bool:
-        # Aravis does not tell. True means that the value is read back only when it is written.
+        # Aravis does not report it. True means that the value is read back only when it is written.
         return True
 
     def read(self) -> Value:

@@ -3,12 +3,12 @@
  *   directory of this .cti    host.ports          register spaces of system and interface
  *                             SERIAL.camera       one simulated camera: see layout.py
  *
- * The producer knows a handful of registers (layout.h); whatever else the XML describes is memory.
+ * The producer interprets a handful of registers (layout.h); everything else that the XML describes is memory.
  * A thread per stream takes lines out of the camera's ring, cuts Width x BufferHeight out of them, packs them
- * as PixelFormat says and fills the announced buffers. It always takes: without a buffer lines are lost and
- * counted, as in a frame grabber. Injected faults happen here.
+ * according to PixelFormat and fills the announced buffers. It never waits for a buffer: lines without one
+ * are lost and counted, as in a frame grabber. Injected faults happen here.
  *
- * Declarations are our own, after the GenICam GenTL standard 1.6.
+ * The declarations are our own, according to the GenICam GenTL standard 1.6.
  */
 #define _GNU_SOURCE
 #include <dirent.h>
@@ -31,8 +31,8 @@
 
 #define API __attribute__((visibility("default")))
 #define MAX_CAMERAS 16
-#define TICK_NS 300000L      /* how often an idle stream looks for lines */
-#define ANSWER_NS 3000000000L /* how long the feeding side may take to obey */
+#define TICK_NS 300000L      /* period at which an idle stream polls for lines */
+#define ANSWER_NS 3000000000L /* time limit for an answer of the feeding side */
 
 typedef int32_t gc_error;
 enum {
@@ -46,12 +46,12 @@ enum { STREAM_FIFO = 0, EVENT_NEW_BUFFER = 1 };
 
 typedef uint64_t word;
 
-/* ---- what there is */
+/* ---- data structures */
 
 struct port {
     const char *name;
     uint8_t *space;
-    struct device *device; /* of the camera's three ports */
+    struct device *device; /* of the three ports of a camera */
     int number;
 };
 
@@ -61,8 +61,8 @@ struct buffer {
     void *user;
     int ours, queued, waiting, incomplete, too_large;
     word frame_id, time_ns, height, width, format, padding;
-    struct buffer *next;     /* in a queue */
-    struct buffer *next_all; /* of the stream */
+    struct buffer *next;     /* next in the queue */
+    struct buffer *next_all; /* next of the stream */
 };
 
 struct queue { struct buffer *first, *last; size_t count; };
@@ -83,7 +83,7 @@ struct device {
     int fd;
     word *words;
     size_t size;
-    word plugged; /* which plugging this handle belongs to */
+    word plugged; /* value of PLUGGED when this handle was made */
     int open;
     char serial[64];
     struct port remote, local;
@@ -132,7 +132,7 @@ static int gone(const struct device *d)
     return !load(&d->words[W_PRESENT]) || load(&d->words[W_PLUGGED]) != d->plugged;
 }
 
-/* ---- answers to the many "get info" calls */
+/* ---- answers to the "get info" calls */
 
 static gc_error give(int32_t *type, int32_t kind, void *out, size_t *size, const void *value, size_t length)
 {
@@ -174,7 +174,7 @@ static int camera_path(char *path, size_t room, const char *serial)
     return snprintf(path, room, "%s/%s%s", tl.directory, serial, SUFFIX) < (int)room;
 }
 
-/* Words of a camera for a look; unmapped by `forget`. Absent, unplugged or foreign files are no camera. */
+/* Map the words of a camera temporarily; `forget` unmaps them. Absent, unplugged or foreign files are no camera. */
 static word *look(const char *serial, int *fd, size_t *size)
 {
     char path[4352];
@@ -599,7 +599,7 @@ static gc_error open_device(struct device *d, const char *serial)
     d->remote = (struct port){"Device", ports + PORT_REMOTE * PORT_BYTES, d, PORT_REMOTE};
     d->local = (struct port){"TLDevice", ports + PORT_DEVICE * PORT_BYTES, d, PORT_DEVICE};
     d->open = 1;
-    set_reg(d->remote.space, REG_TLParamsLocked, 0); /* a host that died may have left it set */
+    set_reg(d->remote.space, REG_TLParamsLocked, 0); /* a host that crashed may have left it set */
     derive(d);
     return OK;
 }
@@ -644,7 +644,7 @@ API gc_error DevClose(void *handle)
 API gc_error DevGetInfo(void *handle, int32_t what, int32_t *type, void *out, size_t *size)
 {
     struct device *d = device_of(handle);
-    return d ? device_info(d->words, d->fd, d->serial, what, type, out, size) : E_HANDLE; /* even when it is gone */
+    return d ? device_info(d->words, d->fd, d->serial, what, type, out, size) : E_HANDLE; /* also after it was unplugged */
 }
 
 API gc_error DevGetParentIF(void *handle, void **parent)
@@ -720,7 +720,7 @@ static void move_all(struct queue *from, struct queue *to)
     }
 }
 
-/* ---- the way of a line */
+/* ---- from a line to a buffer */
 
 struct shape { word width, offset, height, format, row, pitch, sample_bytes, stride, shift_down, shift_up; };
 
@@ -759,7 +759,7 @@ static void pack_row(const struct shape *s, const uint8_t *line, uint8_t *out)
             out[2 * x + 1] = (uint8_t)(v >> 8);
         }
     } else if (s->format == PFNC_Mono10Packed || s->format == PFNC_Mono12Packed) {
-        /* GigE Vision: two pixels in three bytes, the high 8 bits of each outside, the rest in the middle */
+        /* GigE Vision: two pixels in three bytes, the high 8 bits of each on the outside, the rest in the middle */
         unsigned low = value_bits(s->format) == 12 ? 4 : 2, mask = (1u << low) - 1;
         for (word x = 0; x < s->width; x += 2, out += 3) {
             unsigned a = sample(s, line, x), b = x + 1 < s->width ? sample(s, line, x + 1) : 0;
@@ -776,7 +776,7 @@ static void pack_row(const struct shape *s, const uint8_t *line, uint8_t *out)
     }
 }
 
-/* A fault of this kind due at `at` (frame or line), marked as happened; its count, or 0. */
+/* Find a fault of this kind due at `at` (frame or line) and mark it as done; return its count, or 0. */
 static word fault(struct device *d, word kind, word at)
 {
     for (word k = 0; k < FAULTS; k++) {
@@ -827,7 +827,7 @@ static void end_frame(struct stream *s, const struct shape *shape, struct fillin
     struct buffer *b = f->buffer;
     if (b) {
         pthread_mutex_lock(&s->lock);
-        if (!f->bad) b->frame_id = id_of(s->device, f->frame); /* else the header is lost: what was there stays */
+        if (!f->bad) b->frame_id = id_of(s->device, f->frame); /* else the header is lost, and the old value stays */
         b->height = f->cut;
         b->width = shape->width;
         b->format = shape->format;
@@ -882,7 +882,7 @@ static void *fill(void *argument)
     word session = load(&d->words[W_SESSION]);
     while (!__atomic_load_n(&s->end, __ATOMIC_ACQUIRE)) {
         word tail, head;
-        if (load(&d->words[W_SESSION]) != session) { /* a new session counts lines and frames anew */
+        if (load(&d->words[W_SESSION]) != session) { /* a new session counts lines and frames from 0 */
             session = load(&d->words[W_SESSION]);
             if (session & 1) {
                 if (f.buffer) { pthread_mutex_lock(&s->lock); push(&s->input, f.buffer); pthread_mutex_unlock(&s->lock); }
@@ -1011,7 +1011,7 @@ API gc_error DSStartAcquisition(struct stream *s, int32_t flags, uint64_t count)
     if (!is_stream(s)) return E_HANDLE;
     if (s->running) return fail(E_IN_USE, "acquiring already");
     if (gone(s->device)) return fail(E_IO, "camera %s is gone", s->device->serial);
-    gc_error error = ask(s->device, 0); /* a host that died may have left a session open */
+    gc_error error = ask(s->device, 0); /* a host that crashed may have left a session open */
     if (error) return error;
     s->end = s->killed = 0;
     s->delivered = 0;
@@ -1209,7 +1209,7 @@ API gc_error EventKill(struct stream *s)
     return OK;
 }
 
-/* ---- what simulated cameras do not have */
+/* ---- functions that simulated cameras do not have */
 
 API gc_error DSGetBufferChunkData(void *s, void *b, void *chunks, size_t *count)
 {

@@ -1,4 +1,4 @@
-"""What goes to the boards: every port has its pin, the netlist fits, the same sources give the same bytes."""
+"""Designs for the boards: every port has its pin, the netlist fits, the same sources give the same bytes."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def test_every_port_of_the_ulx3s_has_a_pin_of_its_own() -> None:
     assert len({site for _, site in located}) == len(located)
 
 
-def test_the_ulx3s_netlist_fits_a_quarter_of_the_device_and_can_be_made_again(tmp_path: Path) -> None:
+def test_the_ulx3s_netlist_fits_a_quarter_of_the_device_and_is_reproducible(tmp_path: Path) -> None:
     synthesize(tmp_path)
     again = ulx3s.Ulx3s()
     assert (tmp_path / "trigger.il").read_text() == rtlil.convert(again, ports=again.ports, emit_src=False)
@@ -67,7 +67,7 @@ def test_the_pll_of_usb_is_within_its_limits_too() -> None:
     assert (oscillator_mhz / divide["CLKOP"], oscillator_mhz / divide["CLKOS"]) == (48, 12)
 
 
-def test_one_command_writes_what_the_vendor_s_tools_need(tmp_path: Path) -> None:
+def test_one_command_writes_the_input_of_the_vendor_s_tools(tmp_path: Path) -> None:
     assert main(["xc4vsx55", "--out", str(tmp_path / "one")]) == 0
     assert main(["xc4vsx55", "--out", str(tmp_path / "two")]) == 0
     written = {path.name: path.read_bytes() for path in (tmp_path / "one").iterdir()}
@@ -82,5 +82,5 @@ def test_one_command_writes_what_the_vendor_s_tools_need(tmp_path: Path) -> None
 
 
 def module_trigger(source: str) -> str:
-    """The text of the Verilog module that the board's pins belong to."""
+    """Return the text of the Verilog module with the board's pins."""
     return re.split(r"^endmodule", source[source.index("\nmodule trigger(") :], flags=re.MULTILINE)[0]

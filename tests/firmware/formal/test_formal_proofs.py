@@ -1,4 +1,4 @@
-"""The gateware keeps its promises in every clock of every run; with a line of it changed, a proof breaks."""
+"""The proofs hold for every clock of every run; if a line of the gateware is changed, one breaks."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from firmware.formal.proofs import PROOFS
 
 
 @pytest.mark.parametrize("name", PROOFS)
-def test_is_proved_and_says_something(name: str) -> None:
+def test_the_proof_holds_and_is_not_vacuous(name: str) -> None:
     proof = PROOFS[name]()
     verdict = prove(proof)
     assert verdict.broken == ()

@@ -1,4 +1,4 @@
-"""One compiled device on the bench: requests answered at once, pins written down clock by clock."""
+"""One compiled device on the bench: requests answered at once, pins recorded clock by clock."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ ANSWER_CLOCKS = 100_000
 
 
 class Bench:
-    """Sequences are counted; tags are put aside in ``tags`` with their sequences."""
+    """Sequences are counted; tags are collected in ``tags`` with their sequences."""
 
     def __init__(self, twin: Twin) -> None:
         self.twin = twin
@@ -70,7 +70,7 @@ class Bench:
         return sum(word << 32 * i for i, word in enumerate(parse_write(answer.payload)[1]))
 
     def write(self, address: int, words: Sequence[int]) -> tuple[int, int] | None:
-        """What is wrong, None if nothing."""
+        """Return the error, or None."""
         answer = self.ask(FrameType.WRITE, write_payload(address, words))
         if answer.type == FrameType.ACK:
             return None
@@ -88,14 +88,14 @@ class Bench:
         return State(r.STATUS.state.of(self.read(r.STATUS)))
 
     def finish(self, clocks: int) -> None:
-        """Until the run has ended and its last tag has come."""
+        """Run until the run has ended and its last tag has arrived."""
         limit = self.twin.clock + clocks
         while not self.tags or not self.tags[-1][1].flags & r.TagFlag.LAST:
             assert self.twin.clock < limit, "the run does not end"
             self.run(1000)
 
     def levels(self, first: int, count: int) -> NDArray[np.uint16]:
-        """Pins in every clock from ``first`` on."""
+        """Return the pins in every clock from ``first`` on."""
         clocks = np.array([clock for clock, _ in self.changes])
         pins = np.array([int(pins) for _, pins in self.changes], np.uint16)
         return pins[np.searchsorted(clocks, np.arange(first, first + count), side="right") - 1]

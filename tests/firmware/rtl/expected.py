@@ -1,4 +1,4 @@
-"""What the pins of a run must do, worked out from the registers' documentation with numpy alone."""
+"""Expected pins of a run, derived from the registers' documentation with numpy alone."""
 
 from __future__ import annotations
 

@@ -15,7 +15,7 @@ CLOCK_HZ = 1_000_000_000
 
 
 class HandClock:
-    """Time that passes when it is told to."""
+    """Clock that is advanced by hand."""
 
     def __init__(self) -> None:
         self.now_ns = 1000
@@ -42,7 +42,7 @@ class Pair:
         self.tags: list[tuple[int, r.TagRecord]] = []
 
     def ask(self, kind: int, payload: bytes, compare: bool = True) -> tuple[Frame, Frame]:
-        """The two answers."""
+        """Return the two answers."""
         self._sequence += 1
         theirs = self.device.ask(kind, payload)
         self.model.feed(encode(Frame(kind, self._sequence, payload)))
@@ -51,20 +51,20 @@ class Pair:
         return theirs, mine
 
     def take(self) -> list[Frame]:
-        """What the model says; its tags are put aside."""
+        """Return the answers of the model; its tags are collected."""
         frames = self._decoder.feed(self.model.take())
         self.tags += [(f.sequence, r.unpack_tag(f.payload)) for f in frames if f.type == FrameType.TAG]
         return [frame for frame in frames if frame.type != FrameType.TAG]
 
     def write(self, address: int, words: list[int]) -> bool:
-        """Whether it was taken."""
+        """Return whether it was accepted."""
         return self.ask(FrameType.WRITE, write_payload(address, words))[0].type == FrameType.ACK
 
     def command(self, command: int, run: int = 0) -> bool:
         return self.write(r.RUN_ID.address, [*r.RUN_ID.to_words(run), command])
 
     def read(self, register: r.Register, compare: bool = True) -> tuple[int, int]:
-        """What the gateware and the model read."""
+        """Return the values read from the gateware and the model."""
         answers = self.ask(FrameType.READ, read_payload(register.address, register.words), compare)
         gateware, model = (
             sum(word << 32 * i for i, word in enumerate(parse_write(answer.payload)[1])) for answer in answers

@@ -1,4 +1,4 @@
-"""The compiled gateware under what boards and hosts do to it."""
+"""The compiled gateware with realistic boards and hosts."""
 
 from __future__ import annotations
 
@@ -75,7 +75,7 @@ def test_requests_that_fill_the_announced_room_are_all_answered() -> None:
         assert [device.answer().type for _ in range(count)] == [FrameType.ACK] * count
 
 
-def test_damaged_bytes_are_counted_and_never_believed() -> None:
+def test_damaged_bytes_are_counted_and_never_accepted() -> None:
     choose = random.Random(4)
     with bench() as device:
         device.put(r.SUBSTEP_CLOCKS, 777)
@@ -102,7 +102,7 @@ def test_damaged_bytes_are_counted_and_never_believed() -> None:
         (Frame(FrameType.WRITE, 3, b""), ErrorCode.BAD_LENGTH),
     ],
 )
-def test_a_request_of_bad_form_is_refused(frame: Frame, error: ErrorCode) -> None:
+def test_a_malformed_request_is_refused(frame: Frame, error: ErrorCode) -> None:
     with bench() as device:
         device.twin.feed(encode(frame))
         answer = device.answer()
@@ -133,7 +133,7 @@ def test_the_loss_of_the_clock_ends_the_run_and_forbids_the_next() -> None:
         assert device.command(Command.ARM, 2) == (ErrorCode.CLOCK_UNLOCKED, r.STATUS.address)
 
 
-def test_strobes_missed_and_unexpected_are_counted_and_told_once() -> None:
+def test_missed_and_unexpected_strobes_are_counted_and_reported_once() -> None:
     config = RUN | {
         r.TRIGGER_A: r.TRIGGER_A.pack(enable=1, strobe=1),
         r.SUBSTEP_CLOCKS: 100,
@@ -169,7 +169,7 @@ def test_the_pulse_per_second_is_latched() -> None:
             assert 0 <= device.read(r.PPS_TIME) - edge <= 4
 
 
-def test_tags_that_find_no_room_are_counted_and_the_next_says_so() -> None:
+def test_tags_lost_to_a_full_queue_are_counted_and_reported_by_the_next() -> None:
     with bench() as device:
         start(device, RUN | {r.TAG_INTERVAL: 1}, 4)
         device.twin.set("clear_to_send", False)  # the host stalls
@@ -202,7 +202,7 @@ def test_the_tag_fifo_outlasts_a_host_that_stalls_for_100_ms() -> None:
         assert [number for number, _ in device.tags] == list(range(len(device.tags)))
 
 
-def test_a_build_says_what_it_is() -> None:
+def test_a_build_reports_its_properties() -> None:
     with bench() as device:
         assert device.read(r.SERIAL) == BUILD.serial
         assert device.read(r.CODE_BITS) == 1 << 19
@@ -211,7 +211,7 @@ def test_a_build_says_what_it_is() -> None:
         assert device.write(beyond - 1, [7]) is None
 
 
-def test_a_second_that_begins_in_a_run_has_a_tag() -> None:
+def test_a_pulse_per_second_during_a_run_has_a_tag() -> None:
     with bench() as device:
         device.twin.set("pps", True)  # before the run: latched, and told to nobody
         device.run(100)

@@ -1,4 +1,4 @@
-"""The gateware and its behavioural model are given the same bytes, and must say and do the same."""
+"""The gateware and its behavioural model get the same bytes and must behave in the same way."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def pair() -> Iterator[Pair]:
 
 
 @pytest.mark.parametrize("seed", range(CONFIGURATIONS))
-def test_the_model_says_and_does_what_the_gateware_does(pair: Pair, seed: int) -> None:
+def test_the_model_behaves_like_the_gateware(pair: Pair, seed: int) -> None:
     choose = random.Random(1000 + seed)
     for run in range(1, RUNS + 1):
         config, code = random_run(choose)
@@ -51,7 +51,7 @@ def test_the_model_says_and_does_what_the_gateware_does(pair: Pair, seed: int) -
 
 
 def spoil(choose: random.Random, config: dict[r.Register, int]) -> None:
-    """One thing that arming may have to refuse, as often as not by just so much."""
+    """Change one setting so that arming may have to refuse it, often at the very limit."""
     clocks, line = config[r.SUBSTEP_CLOCKS], r.LINE.unpack(config[r.LINE])
     distance = clocks if line["mode"] == LineMode.PER_SUBSTEP else line_clocks(config)
     by = choose.choice([-1, 0, 1, choose.randrange(100)])
@@ -79,7 +79,7 @@ def spoil(choose: random.Random, config: dict[r.Register, int]) -> None:
 
 
 def load(choose: random.Random, pair: Pair, config: dict[r.Register, int], code: NDArray[np.uint8]) -> None:
-    """The code memory; now and then without the check that a run with it needs."""
+    """Load the code memory, sometimes without the check that a run with it needs."""
     if r.CODE_SOURCE.kind.of(config[r.CODE_SOURCE]) != Source.MEMORY:
         return
     packed = np.packbits(code[:200], bitorder="little").tobytes() + bytes(3)

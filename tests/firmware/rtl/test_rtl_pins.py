@@ -1,4 +1,4 @@
-"""The compiled gateware against what the registers' documentation promises, in random configurations."""
+"""The compiled gateware compared with the documentation of the registers, in random configurations."""
 
 from __future__ import annotations
 
@@ -76,7 +76,7 @@ def check_tags(device: Bench, config: dict[r.Register, int], lines: int, run: in
 
 
 def load(device: Bench, config: dict[r.Register, int], code: NDArray[np.uint8]) -> None:
-    """The code memory, where the run uses it."""
+    """Load the code memory, if the run uses it."""
     if r.CODE_SOURCE.kind.of(config[r.CODE_SOURCE]) == Source.MEMORY:
         length = config[r.CODE_LENGTH]
         packed = np.packbits(code[:length], bitorder="little").tobytes()

@@ -41,7 +41,7 @@ def page() -> Iterator[PinPage]:
 
 @pytest.fixture
 def opened() -> list[RtlTransport]:
-    """What the driver has opened, in turn."""
+    """Return everything that the driver has opened, in order."""
     return []
 
 
@@ -80,7 +80,7 @@ def test_cameras_see_the_pulses_and_the_light_that_the_pins_gave(
         assert not after[6:].any()
 
 
-def test_light_that_is_forgotten_is_an_error(page: PinPage) -> None:
+def test_reading_light_that_was_discarded_is_an_error(page: PinPage) -> None:
     page.publish(PinRun(1, True, (5, 5), 60), bytes(100), CLOCK_HZ)
     page.publish(PinRun(2, True, (1, 1), 60), bytes(10), CLOCK_HZ)
     with pytest.raises(DeviceError, match="run 1 of the trigger is over"):
@@ -141,7 +141,7 @@ def test_without_a_compiler_the_rig_says_what_to_install(
 
 
 def test_the_demo_records_from_the_gateware(tmp_path: Path) -> None:
-    """Every pixel is Eq. (1) with the code that was asked for; the light came from the LED's pin."""
+    """Every pixel follows Eq. (1) with the requested code; the light came from the LED's pin."""
     out = tmp_path / "out"
     out.mkdir()
     captured = record(DemoPlan(out, lines=700, trigger="rtl"), Journal())

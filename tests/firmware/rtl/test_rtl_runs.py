@@ -65,8 +65,8 @@ def test_a_long_run_equals_the_jump_ahead() -> None:
         assert device.read(r.CODE_STATE) == prbs_state(mask, seed, 3 * (device_lines - 1))
 
 
-def test_the_whole_code_memory_is_played_summed_up_and_read_back() -> None:
-    """512 kbit: the last word is as good as the first, and the code begins again behind it."""
+def test_the_whole_code_memory_is_played_checked_and_read_back() -> None:
+    """512 kbit: the last word is as good as the first, and the code repeats after it."""
     bits = np.random.default_rng(5).integers(0, 2, 1 << 19, np.uint8)
     words = np.packbits(bits, bitorder="little").view("<u4").tolist()
     with bench() as device:
@@ -123,7 +123,7 @@ def test_any_mask_and_seed_of_64_bits_make_the_code() -> None:
             assert list(device.twin.take_light()) == [prbs_state(mask, seed, k) & 1 for k in range(120)]
 
 
-def test_a_falling_edge_starts_where_that_is_asked() -> None:
+def test_a_falling_edge_starts_the_run_if_configured() -> None:
     config = RUN | {r.EXTERNAL_ARM: r.EXTERNAL_ARM.pack(enable=1, invert=1), r.LINE_BUDGET: 2}
     with bench() as device:
         for register, value in config.items():
@@ -154,7 +154,7 @@ def test_an_edge_before_the_arming_starts_nothing() -> None:
         assert device.read(r.LINES) == device.read(r.START_TIME) == 0
 
 
-def test_the_fewest_clocks_of_a_substep_are_kept_with_every_source_of_light() -> None:
+def test_the_shortest_substep_is_exact_with_every_code_source() -> None:
     """1.8 MHz is 50 clocks; five is the least."""
     with bench() as device:
         limits = r.LIMITS.unpack(device.read(r.LIMITS))

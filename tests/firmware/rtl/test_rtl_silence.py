@@ -1,4 +1,4 @@
-"""A host that falls silent, at any point of its life: gateware and model end the run alike, and stay dark.
+"""A host that falls silent at any time: gateware and model end the run alike, and stay dark.
 
 Nobody reads STATUS to find out, since that is a sign of life: pins and tags are what is looked at.
 """
@@ -57,7 +57,7 @@ def pair() -> Iterator[Pair]:
 
 
 def arm(both: Pair, period: int, substep: int, substeps: int, lead: int, invert: int, budget: int = 0) -> int:
-    """The run armed in both, lit whenever it can be; clocks of a line."""
+    """Arm the run in both, with as much light as possible; return the clocks of a line."""
     config = {
         r.SUBSTEP_CLOCKS: substep,
         r.WINDOW_CLOSE: substep,
@@ -135,7 +135,7 @@ def assert_dark_after(both: Pair, invert: int) -> None:
 def test_silence_from_the_start_on_ends_the_run_in_the_same_line(
     by_edge: bool, invert: int, substep: int, substeps: int, lead: int, lines: int, off: int, budget: int
 ) -> None:
-    """The period is that many lines, to the clock: the first that does not fit ends the run a line later."""
+    """The period is exactly this number of lines: the first that does not fit ends the run a line later."""
     with pair() as both:
         period = max(1, lines * substep * substeps + off)
         line = arm(both, period, substep, substeps, lead, invert, budget)
@@ -157,7 +157,7 @@ def test_silence_from_the_start_on_ends_the_run_in_the_same_line(
     sign=st.sampled_from(sorted(LIFE)),
     noise=st.sampled_from(sorted(NOISE)),
 )
-def test_silence_after_signs_of_life_is_counted_from_the_last(
+def test_silence_is_counted_from_the_last_request(
     by_edge: bool, lead: int, gaps: list[int], sign: str, noise: str
 ) -> None:
     """Requests every ten to fourteen lines keep a watchdog of sixteen and a half quiet; noise does not."""
@@ -182,7 +182,7 @@ def start_tick(both: Pair) -> int:
 
 
 def say(both: Pair, data: bytes, heard: int, tick: int) -> None:
-    """Bytes that the gateware hears in clock ``heard`` of its TIME, the model at ``tick``."""
+    """Send bytes that arrive in clock ``heard`` of the gateware's TIME, and at ``tick`` of the model."""
     device = both.device
     ahead = heard - device.twin.clock - BYTE_CLOCKS * max(len(data) - 1, 0) - HEARD_CLOCKS
     assert ahead >= 0
@@ -193,7 +193,7 @@ def say(both: Pair, data: bytes, heard: int, tick: int) -> None:
 
 
 @pytest.mark.parametrize("by_edge", [False, True])
-def test_a_host_that_only_asked_to_stop_is_not_told_of_the_watchdog(by_edge: bool) -> None:
+def test_a_requested_stop_is_not_reported_as_a_watchdog_end(by_edge: bool) -> None:
     with pair() as both:
         line = arm(both, 1200 * 16 + 600, 400, 3, 0, 0)
         both.device.changes.clear()
@@ -225,5 +225,5 @@ def test_a_host_that_dies_before_the_start_leaves_it_dark(invert: int) -> None:
         assert both.device.tags == both.tags == []
 
 
-def test_the_model_knows_the_gateware_s_clocks() -> None:
+def test_the_model_has_the_gateware_s_latencies() -> None:
     assert (RUN_CLOCKS, BARK_CLOCKS) == (timing.START_CLOCKS, watchdog.BARK_CLOCKS)

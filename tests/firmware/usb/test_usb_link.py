@@ -1,4 +1,4 @@
-"""The USB link as a host sees it: who it says it is, and every byte both ways whatever the packets."""
+"""The USB link as a host sees it: its identity, and every byte in both directions for any packets."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def simulate(
 
 
 def echo(bus: Any) -> Elaboratable:
-    """A link whose bytes come straight back."""
+    """A link that returns its bytes."""
     m = Module()
     m.submodules.link = link = UsbLink(bus, serial=42)
     wiring.connect(m, link.received, link.sending)
@@ -110,7 +110,7 @@ def test_the_trigger_answers_over_usb() -> None:
     simulate(test, trigger)
 
 
-def test_the_udev_rule_is_about_this_device() -> None:
+def test_the_udev_rule_matches_this_device() -> None:
     (rule,) = (Path(firmware.__file__).parent / "udev").glob("*.rules")
     assert f'ATTR{{idVendor}}=="{VENDOR:04x}", ATTR{{idProduct}}=="{PRODUCT:04x}"' in rule.read_text()
     assert int(rule.name[:2]) < 73, "TAG uaccess has no effect from 73 on"

@@ -1,4 +1,4 @@
-"""What every device behind the driver must do: the model in its two forms, and the gateware."""
+"""Requirements for every device behind the driver: the model in its two forms, and the gateware."""
 
 from __future__ import annotations
 
@@ -26,14 +26,14 @@ MASK = sum(1 << tap - 1 for tap in (64, 63, 61, 60))
 
 
 class TestAnyTrigger(TriggerContract):
-    """What is asked of every trigger, asked of every twin."""
+    """The requirements for every trigger, checked with every twin."""
 
     @pytest.fixture
     def trigger(self, bench: Bench) -> TriggerDriver:
         return bench.driver()
 
 
-def test_the_device_says_who_it_is(bench: Bench) -> None:
+def test_the_device_identifies_itself(bench: Bench) -> None:
     driver = bench.driver()
     identity, can = driver.identify(), driver.device().capabilities
     assert identity.clock_hz == CLOCK_HZ
@@ -71,7 +71,7 @@ def test_a_run_from_start_to_stop(bench: Bench) -> None:
     )
 
 
-def test_the_register_stands_where_the_host_says_it_does(bench: Bench) -> None:
+def test_the_prbs_register_has_the_state_computed_by_the_host(bench: Bench) -> None:
     driver = bench.driver(line_budget=300)
     driver.prepare(run())
     driver.start()
@@ -208,7 +208,7 @@ def test_code_memory_loads_checks_and_reads_back(bench: Bench) -> None:
     assert not driver.device().status().code_checked
 
 
-def test_what_the_device_cannot_take_is_refused_by_name(bench: Bench) -> None:
+def test_unsupported_settings_are_refused_by_name(bench: Bench) -> None:
     link = bench.driver().device().link
     for address, words, code in (
         (r.ID.address, [1], ErrorCode.READ_ONLY),
@@ -259,7 +259,7 @@ def test_an_external_edge_starts_an_armed_run(bench: Bench) -> None:
     driver.stop()
 
 
-def test_no_external_edge_is_an_error_in_time(bench: Bench) -> None:
+def test_a_missing_external_edge_is_an_error_after_the_time_limit(bench: Bench) -> None:
     driver = bench.driver(external_start="rising", external_timeout_s=0.1)
     driver.prepare(run())
     with pytest.raises(TriggerError, match=r"did not start within 0\.1 s"):
@@ -267,7 +267,7 @@ def test_no_external_edge_is_an_error_in_time(bench: Bench) -> None:
     assert driver.stop() == 0
 
 
-def test_unplugging_is_told_to_everyone_at_once(bench: Bench) -> None:
+def test_unplugging_is_reported_to_every_waiter_at_once(bench: Bench) -> None:
     driver = bench.driver()
     driver.prepare(run())
     driver.start()

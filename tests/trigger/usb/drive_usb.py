@@ -1,4 +1,4 @@
-"""A run over pyusb, libusb-1.0 and what it takes for a bus; says what happened, one JSON text per line."""
+"""A run over pyusb, libusb-1.0 and the simulated bus; prints the events as one JSON text per line."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""pyusb on the system's own libusb-1.0, on a bus made up by umockdev; left out where there is none."""
+"""pyusb on the system's own libusb-1.0, on a bus simulated by umockdev; skipped if there is none."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ HERE = Path(__file__).parent
 
 
 @pytest.mark.needs_umockdev
-def test_the_driver_runs_over_libusb_and_hears_of_an_unplugged_cable() -> None:
+def test_the_driver_runs_over_libusb_and_reports_an_unplugged_cable() -> None:
     paths = os.pathsep.join(map(str, (HERE.parent, HERE.parents[1], HERE.parents[2])))
     with wired_model() as model:
         twin = PtyTwin(model)
