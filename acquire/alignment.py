@@ -56,12 +56,23 @@ class Alignment:
         rotation = np.array([[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]])
         return self.magnification * rotation
 
+    def to_b(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return where points (2, m, n) of arm A's view are in arm B's, from the centre of the field."""
+        found: NDArray[np.float64] = np.tensordot(self.matrix, points, axes=1) + self._shift
+        return found
+
+    def to_a(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return where points (2, m, n) of arm B's view are in arm A's, from the centre of the field."""
+        return np.tensordot(np.linalg.inv(self.matrix), points - self._shift, axes=1)
+
+    @property
+    def _shift(self) -> NDArray[np.float64]:
+        return np.array([[[self.rows]], [[self.columns]]])
+
     def sources(self, size: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return the row and column (size, size) of arm A's view that each fine pixel of arm B's shows."""
         centre = (size - 1) / 2
-        in_b = np.indices((size, size), np.float64)
-        offset = np.array([centre + self.rows, centre + self.columns])
-        rows, columns = np.tensordot(np.linalg.inv(self.matrix), in_b - offset[:, None, None], axes=1)
+        rows, columns = self.to_a(np.indices((size, size), np.float64) - centre)
         return rows + centre, columns + centre
 
     def facts(self) -> dict[str, Any]:

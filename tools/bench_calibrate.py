@@ -7,10 +7,12 @@ light, an uneven beam splitter, and an arm B that is shifted, rotated and magnif
 point spread. Dark, flat and target are recorded with ``--lines`` lines each and calibrated as `acquire
 calibrate` does; the target consists of random dots of 2 to 6 fine pixels. In every second instrument the
 flat's light ends at the field's edge. Then a scene of three lamps of random shapes, positions and frequencies
-is reconstructed from 263 lines (voxels 3 x 1): as recorded, calibrated, and from lines with only the same
-noise. Columns: errors of shift (fine pixels), rotation (degrees), DN per electron (%), gains and offsets in
-the worst column that the optics do not hide (%, DN; gain_inner: without the outermost columns, where light
-lost at the field's edge is mistaken for gain), the splitter (%), PSNR in dB, seconds.
+is reconstructed from 263 lines (voxels 3 x 1): as recorded, calibrated, from lines with only the same noise,
+and from lines that also have the splitter's unequal shares and the ambient light, exactly known (known_db):
+no calibration takes away the noise that these add. Columns: errors of shift (fine pixels), rotation
+(degrees), DN per electron (%), gains and offsets in the worst column that the optics do not hide (%, DN;
+gain_inner: without the outermost columns, where light lost at the field's edge is mistaken for gain), the
+splitter (%), PSNR in dB, seconds.
 
 --orientations draws 24 instruments instead (eight views of arm B, three targets each) and counts the answers.
 """
@@ -21,7 +23,7 @@ import argparse
 import json
 import tempfile
 import time
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -54,6 +56,7 @@ K = 0.1
 SEGMENT = 263
 LIGHT = {"dark": 0, "flat": 1, "target": None, "scene": None}
 NOISE = ("shot_noise", "read_noise", "dark_current")
+LIGHTS = ("beam_splitter", "stray_light")
 DARK = ("prnu", "column_offsets", "stray_light", "beam_splitter", "dark_current")
 
 
@@ -234,12 +237,26 @@ def fixed(drawn: Drawn, kind: str, kinds: tuple[str, ...], directory: Path) -> N
 def pictures(drawn: Drawn, known: Calibration, directory: Path) -> dict[str, float]:
     """PSNR of the reconstructed lamps: as recorded, calibrated, and with noise only."""
     noise = [effect for effect in drawn.effects if effect["kind"] in NOISE]
+    light = [effect for effect in drawn.effects if effect["kind"] in (*NOISE, *LIGHTS)]
     paths = {
         "raw": drawn.record("scene", directory, 400),
         "noise": drawn.record("scene", directory, 400, noise),
+        "known": drawn.record("scene", directory, 400, light),
     }
     cuts = {name: open_recording(path).cut(70, SEGMENT) for name, path in paths.items()}
-    cases = {"raw": cuts["raw"], "calibrated": calibrated(cuts["raw"], known), "noise": cuts["noise"]}
+    cases = {
+        "raw": cuts["raw"],
+        "calibrated": calibrated(cuts["raw"], known),
+        "noise": cuts["noise"],
+        "known": replace(
+            cuts["known"],
+            black_level_dn=fixed(drawn, "dark", (*LIGHTS, "dark_current"), directory),
+            responsivity_dn=2
+            * cuts["known"].responsivity_dn
+            * np.repeat([[drawn.part_a], [1 - drawn.part_a]], 64, 1),
+            balanced=True,
+        ),
+    }
     scene = build_scene(drawn.scene("scene", [], directory), 192, 1e-5)
     truth = merge_video(scene.frames(3 * 70, cuts["raw"].geometry.span), 3, 1)
     found = {}

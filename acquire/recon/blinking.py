@@ -199,6 +199,7 @@ def _in_patterns(
         return None
     basis = TemporalBasis(first.basis.frames, first.basis.count, problem.arrays)
     merges = (options.spatial_merge, options.temporal_merge)
+    clock.reset()  # the limit holds for each stage: the first look takes longer where patterns are in doubt
     refinement = _with_needed_patterns(Refinement(segment, problem, basis, found, merges), problem, clock)
     best, kept, idle = np.inf, refinement.found, 0
     best_weight, held_best, recent = refinement.parameters.tv_weight, np.inf, np.inf

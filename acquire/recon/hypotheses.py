@@ -16,6 +16,7 @@ from functools import lru_cache
 from typing import TYPE_CHECKING
 
 import numpy as np
+from scipy.ndimage import map_coordinates
 
 from acquire.recon.gaussian import Fit, Model, Prior, Response, best_model
 
@@ -68,6 +69,20 @@ def _transposed(scene: Scene) -> Scene:
     finer = rows // pixels
     merged = scene.reshape(pixels, finer, cosines, pixels).mean(1, dtype=np.float32)
     return np.asarray(np.repeat(merged.transpose(2, 1, 0), finer, axis=0))
+
+
+def _displaced(scene: Scene, size: int, sources: Callable[[Floats], Floats]) -> Scene:
+    """The scene as it appears in another view, whose points show what lies at ``sources`` in this one.
+
+    Points (2, …) are in fine pixels from the centre of a field of ``size``. Beyond its edge, the edge
+    continues.
+    """
+    rows, cosines, pixels = scene.shape
+    cell = size / np.array([[[rows]], [[pixels]]])
+    centre = (np.array([[[rows]], [[pixels]]]) - 1) / 2
+    found = sources((np.indices((rows, pixels)) - centre) * cell) / cell + centre
+    views = [map_coordinates(scene[:, k], found, order=1, mode="nearest") for k in range(cosines)]
+    return np.stack(views, axis=1)
 
 
 AS_BUILT = Turn()
@@ -126,6 +141,7 @@ class LineModel:
         self.substeps = segment.geometry.substeps
         self.stages = segment.geometry.stages
         self._bits = bits or padded(segment.code)
+        self._size, self._alignment = segment.geometry.size, segment.alignment
         self.first, self.arms = prepared_lines(segment)
         self.lines, self.pixels = self.arms[0].shape
         self._view = lru_cache(maxsize=64)(self._make_view)
@@ -152,7 +168,13 @@ class LineModel:
         views = [self.view(hypothesis, arm) for arm in (0, 1)]
         own = [view.fits[arm].blocks for arm, view in enumerate(views)]
         turn = hypothesis.turn
-        scenes = (turn.to_a(views[1].scene(1)), turn.to_b(views[0].scene(0)))
+        a, b = views[0].scene(0), turn.to_a(views[1].scene(1))
+        if self._alignment is not None:
+            a, b = (
+                _displaced(a, self._size, self._alignment.to_a),
+                _displaced(b, self._size, self._alignment.to_b),
+            )
+        scenes = (b, turn.to_b(a))
         gain = [view.gain(arm, each) for arm, (view, each) in enumerate(zip(views, scenes, strict=True))]
         return Evidence(np.concatenate(own), np.concatenate(gain))
 

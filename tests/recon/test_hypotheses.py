@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
 
+from acquire.alignment import Alignment
 from acquire.codes import mix_seed, prbs
 from acquire.forward import DualArm
 from acquire.geometry import Geometry
@@ -22,7 +23,7 @@ def lit_by(seed: int, start: int = 0, geometry: Geometry = GEOMETRY) -> np.ndarr
     return prbs(31, mix_seed(seed, 31), start, geometry.span)
 
 
-def recorded(scene_seed: int = 1, *, texture: float = 3.0) -> Segment:
+def recorded(scene_seed: int = 1, *, texture: float = 3.0, alignment: Alignment | None = None) -> Segment:
     """A bright disc that passes before a textured still, with a camera's noise."""
     rng, n = np.random.default_rng(scene_seed), GEOMETRY.size
     ground = gaussian_filter(rng.standard_normal((n, n)), texture, mode="wrap")
@@ -35,7 +36,7 @@ def recorded(scene_seed: int = 1, *, texture: float = 3.0) -> Segment:
         ]
     ).astype(np.float32)
     code = lit_by(scene_seed)
-    exact = DualArm(GEOMETRY, code).forward(video)
+    exact = DualArm(GEOMETRY, code, alignment=alignment).forward(video)
     lines = exact + rng.standard_normal(exact.shape) * 0.01 * exact.max()
     return Segment(
         lines=lines,
@@ -43,6 +44,7 @@ def recorded(scene_seed: int = 1, *, texture: float = 3.0) -> Segment:
         code=code,
         geometry=GEOMETRY,
         time_ns=np.arange(GEOMETRY.lines, dtype=np.int64) * 30_000,
+        alignment=alignment,
     )
 
 
@@ -62,6 +64,15 @@ def test_a_late_code_is_named_to_the_substep() -> None:
         inquiry = found(replace(segment, code=lit_by(1, late)))
         assert inquiry.standing is Standing.NAMED
         assert inquiry.best.hypothesis == Hypothesis(late=(late, late))
+
+
+def test_a_known_displacement_of_arm_b_is_not_taken_for_a_delay() -> None:
+    segment = recorded(alignment=Alignment(rows=4.4, columns=-3.7, turn_deg=0.6, magnification=1.003))
+    assert found(segment).standing is Standing.RIGHT
+    assert found(replace(segment, alignment=None)).standing is not Standing.RIGHT
+    late = found(replace(segment, code=lit_by(1, 3)))
+    assert late.standing is Standing.NAMED
+    assert late.best.hypothesis == Hypothesis(late=(3, 3))
 
 
 def test_an_inverted_code_is_named() -> None:
