@@ -32,8 +32,8 @@ if TYPE_CHECKING:
 
 FIRST_LOOK, LONGER_LOOK = 60, 90
 """Number of iterations in the cosines before patterns are looked for; the latter if patterns are in doubt."""
-FIRST_LOOK_SHARE = 0.7
-"""Upper limit on the first look's share of the budget."""
+FIRST_LOOK_SHARE, LONGER_SHARE = 0.7, 0.4
+"""Upper limit on the first look's share of the budget, and the share after which it is not made longer."""
 BEYOND_S = 2e-6
 """Time per line and frame of the search for light beyond the band, which is skipped if less is left."""
 WIDER_SHARE = 0.5
@@ -179,7 +179,7 @@ def _look(
         most = min(look, -(-4 * options.iterations // 5))
         for _ in clock.run(most - clock.done, "first look", FIRST_LOOK_SHARE, estimate.video):
             estimate.solver.step()
-        if find_patterns(host(estimate.solver.theta), beyond_doubt=True):
+        if find_patterns(host(estimate.solver.theta), beyond_doubt=True) or clock.spent(LONGER_SHARE):
             break
     return estimate
 
