@@ -15,6 +15,8 @@ gain_inner: without the outermost columns, where light lost at the field's edge 
 splitter (%), PSNR in dB, seconds.
 
 --orientations draws 24 instruments instead (eight views of arm B, three targets each) and counts the answers.
+--measured takes the instrument of configs/scene-leds-measured.toml and its four lamps instead, with arm B
+displaced by three amounts; known_db has all effects that no calibration holds.
 """
 
 from __future__ import annotations
@@ -25,7 +27,7 @@ import tempfile
 import time
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
@@ -35,7 +37,7 @@ from acquire.calibrate.exposure import instrument_of, open_exposure
 from acquire.calibrate.orientation import VIEWS
 from acquire.calibrate.target import alignment, orientation
 from acquire.calibrate.transfer import transfer
-from acquire.config import load_rig
+from acquire.config import load_rig, load_scene
 from acquire.forward import merge_video
 from acquire.recon import reconstruct
 from acquire.sim.leds import LedSceneConfig
@@ -75,6 +77,9 @@ class Drawn:
     beyond: str
     blur: float
     code_seed: int
+
+    known: ClassVar[tuple[str, ...]] = LIGHTS
+    """Effects of the lines that a reconstruction would have after a perfect calibration."""
 
     @classmethod
     def at_random(cls, seed: int) -> Drawn:
@@ -140,6 +145,34 @@ class Drawn:
         )
         black = {f"cameras.{arm}.black_level_dn": BLACK_DN for arm in "ab"}
         return load_rig("rig-demo", black | code)
+
+
+DISPLACED = ((0.3, -0.2, 0.0), (1.5, -1.0, 0.3), (6.0, -4.0, 0.5))
+"""Rows and columns (fine pixels) and degrees by which arm B is displaced in `AsMeasured`."""
+
+
+@dataclass(frozen=True)
+class AsMeasured(Drawn):
+    """The instrument and the lamps of configs/scene-leds-measured.toml, with arm B displaced."""
+
+    known: ClassVar[tuple[str, ...]] = ("pwm", "led_rise_fall", "trigger_jitter", "psf", "cti", *LIGHTS)
+
+    @classmethod
+    def displaced(cls, seed: int, rows: float, columns: float, turn_deg: float) -> AsMeasured:
+        drawn = {**asdict(Drawn.at_random(seed)), "part_a": 0.48, "magnification": 1.0, "beyond": "dark"}
+        return cls(**{**drawn, "rows": rows, "columns": columns, "turn_deg": turn_deg, "blur": 0.6})
+
+    @property
+    def effects(self) -> list[dict[str, Any]]:
+        listed = [each.model_dump() for each in load_scene("scene-leds-measured").effects]
+        moved = {"rows": self.rows, "columns": self.columns, "turn_deg": self.turn_deg}
+        return [each | moved if each["kind"] == "misregistration" else each for each in listed]
+
+    def scene(self, kind: str, effects: list[dict[str, Any]], directory: Path) -> SceneConfig:
+        if kind != "scene":
+            return super().scene(kind, effects, directory)
+        table = load_scene("scene-leds-measured").model_dump() | {"seed": self.seed, "effects": effects}
+        return LedSceneConfig.model_validate(table)
 
 
 def lamp(
@@ -237,7 +270,7 @@ def fixed(drawn: Drawn, kind: str, kinds: tuple[str, ...], directory: Path) -> N
 def pictures(drawn: Drawn, known: Calibration, directory: Path) -> dict[str, float]:
     """PSNR of the reconstructed lamps: as recorded, calibrated, and with noise only."""
     noise = [effect for effect in drawn.effects if effect["kind"] in NOISE]
-    light = [effect for effect in drawn.effects if effect["kind"] in (*NOISE, *LIGHTS)]
+    light = [effect for effect in drawn.effects if effect["kind"] in (*NOISE, *drawn.known)]
     paths = {
         "raw": drawn.record("scene", directory, 400),
         "noise": drawn.record("scene", directory, 400, noise),
@@ -250,10 +283,9 @@ def pictures(drawn: Drawn, known: Calibration, directory: Path) -> dict[str, flo
         "noise": cuts["noise"],
         "known": replace(
             cuts["known"],
-            black_level_dn=fixed(drawn, "dark", (*LIGHTS, "dark_current"), directory),
-            responsivity_dn=2
-            * cuts["known"].responsivity_dn
-            * np.repeat([[drawn.part_a], [1 - drawn.part_a]], 64, 1),
+            black_level_dn=fixed(drawn, "dark", (*drawn.known, "dark_current"), directory),
+            responsivity_dn=np.repeat([[2 * drawn.part_a], [2 - 2 * drawn.part_a]], 64, 1)
+            * np.asarray(cuts["known"].responsivity_dn),
             balanced=True,
         ),
     }
@@ -309,6 +341,7 @@ def main() -> None:
     parser.add_argument("--lines", type=int, default=1024)
     parser.add_argument("--no-video", action="store_true")
     parser.add_argument("--orientations", action="store_true")
+    parser.add_argument("--measured", action="store_true")
     parser.add_argument("--json", type=Path)
     add_option(parser)
     options = parser.parse_args()
@@ -322,8 +355,11 @@ def main() -> None:
 def instruments(options: argparse.Namespace, run: Run) -> None:
     """Calibrate random instruments, and print the worst value of each figure."""
     rows = []
-    for number in range(options.instruments):
-        drawn = Drawn.at_random(options.seed + number)
+    if options.measured:
+        chosen: list[Drawn] = [AsMeasured.displaced(options.seed, *each) for each in DISPLACED]
+    else:
+        chosen = [Drawn.at_random(options.seed + number) for number in range(options.instruments)]
+    for number, drawn in enumerate(chosen):
         with tempfile.TemporaryDirectory() as name:
             began = time.perf_counter()
             known = calibrate(drawn, Path(name), options.lines)
