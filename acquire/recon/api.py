@@ -72,7 +72,7 @@ def reconstruct(
     ----------
     segment : lines of both arms, code and mask; masked samples and outliers have no influence. Unless it is
         `balanced`, arms that get clearly different shares of the light are balanced, with a warning
-    preset : limit on the iterations: ``"fast"``, ``"balanced"``, ``"best"``
+    preset : limit on the iterations of each stage: ``"fast"``, ``"balanced"``, ``"best"``
     budget_s : wall time within which the answer is returned, exceeded by at most 10 % + 0.3 s, with fewer
         iterations than the preset's if necessary (at least one). Compilation (once after installation) is not
         part of it
