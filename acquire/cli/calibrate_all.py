@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from acquire.calibrate.guide import AT_ONCE, LINES, MOST_LINES, OPTIONAL, PSF, Step
+from acquire.calibrate.guide import AT_ONCE, LINES, MOST_LINES, NOISE_LINES, OPTIONAL, PSF, Step
 from acquire.cli.calibrate_live import instrument, print_finding, record, save_finding, wait_for_enter
 from acquire.cli.control import SocketOption
 from acquire.cli.output import JsonFlag, note, print_json, print_warning, say
@@ -36,8 +36,14 @@ def calibrate_all(
         typer.Option(metavar="DIR", help="Directory for the recordings, which are kept. Created if needed."),
     ] = Path("calibration-recordings"),
     lines: Annotated[
-        int, typer.Option(min=64, max=MOST_LINES, help="Number of lines of each recording.")
-    ] = LINES,
+        int | None,
+        typer.Option(
+            min=64,
+            max=MOST_LINES,
+            help=f"Number of lines of each recording. Default: {NOISE_LINES} of dark and flat, {LINES} of "
+            "the others.",
+        ),
+    ] = None,
     only: Annotated[
         list[str] | None,
         typer.Option(
@@ -87,7 +93,8 @@ def calibrate_all(
                     hint="leave psf out, or use a pseudo-random code in the rig file",
                 )
         for step in steps:
-            found += _step(daemon, step, out, directory, lines, ask=not yes, quiet=json)
+            count = lines or step.lines or LINES
+            found += _step(daemon, step, out, directory, count, ask=not yes, quiet=json)
     if json:
         print_json({"calibration": out, "steps": {each.step: each.facts for each in found}})
     else:
