@@ -16,7 +16,8 @@ splitter (%), PSNR in dB, seconds.
 
 --orientations draws 24 instruments instead (eight views of arm B, three targets each) and counts the answers.
 --measured takes the instrument of configs/scene-leds-measured.toml and its four lamps instead, with arm B
-displaced by three amounts; known_db has all effects that no calibration holds.
+displaced by three amounts; known_db has all effects that dark, flat and target do not measure. --psf also
+measures the optics' blur, from a checkerboard.
 """
 
 from __future__ import annotations
@@ -35,6 +36,7 @@ from acquire.calibrate import Calibration, calibrated
 from acquire.calibrate.columns import dark, flat
 from acquire.calibrate.exposure import instrument_of, open_exposure
 from acquire.calibrate.orientation import VIEWS
+from acquire.calibrate.psf import psf
 from acquire.calibrate.target import alignment, orientation
 from acquire.calibrate.transfer import transfer
 from acquire.config import load_rig, load_scene
@@ -56,7 +58,8 @@ if TYPE_CHECKING:
 BLACK_DN = 40.0
 K = 0.1
 SEGMENT = 263
-LIGHT = {"dark": 0, "flat": 1, "target": None, "scene": None}
+LIGHT = {"dark": 0, "flat": 1, "target": None, "edges": None, "scene": None}
+SIZE, FINER = 192, 8
 NOISE = ("shot_noise", "read_noise", "dark_current")
 LIGHTS = ("beam_splitter", "stray_light")
 DARK = ("prnu", "column_offsets", "stray_light", "beam_splitter", "dark_current")
@@ -122,11 +125,10 @@ class Drawn:
 
     def scene(self, kind: str, effects: list[dict[str, Any]], directory: Path) -> SceneConfig:
         common = {"seed": self.seed, "system_gain_dn_per_e": K, "effects": effects}
-        if kind == "target":
-            np.save(directory / "dots.npy", dots(self.seed))
-            return VideoSceneConfig.model_validate(
-                {"kind": "video", "path": directory / "dots.npy", **common}
-            )
+        if kind in ("target", "edges"):
+            path = directory / f"{kind}.npy"
+            np.save(path, dots(self.seed) if kind == "target" else checkerboard(self.seed))
+            return VideoSceneConfig.model_validate({"kind": "video", "path": path, **common})
         leds = lamps(self.seed) if kind == "scene" else [lamp("all", "square", (0.5, 0.5, 1.0), level=0.2)]
         return LedSceneConfig.model_validate({"kind": "leds", "leds": leds, **common})
 
@@ -213,15 +215,29 @@ def dots(seed: int) -> NDArray[np.float32]:
     return picture
 
 
-def calibrate(drawn: Drawn, directory: Path, lines: int) -> Calibration:
-    """Dark, flat, transfer, orientation, alignment."""
+def checkerboard(seed: int) -> NDArray[np.float32]:
+    """A turned checkerboard with squares of about 58 fine pixels; pixels hold the mean over their area."""
+    angle = np.deg2rad(np.random.default_rng(seed + 4000).uniform(3, 20))
+    at = (np.arange(SIZE * FINER) + 0.5) / FINER - SIZE / 2
+    y, x = np.meshgrid(at, at, indexing="ij")
+    u, v = y * np.cos(angle) + x * np.sin(angle), x * np.cos(angle) - y * np.sin(angle)
+    squares = (np.floor(3.3 * u / SIZE) + np.floor(3.3 * v / SIZE)) % 2
+    means = squares.reshape(SIZE, FINER, SIZE, FINER).mean(axis=(1, 3))
+    return np.asarray(means, np.float32)[None]
+
+
+def calibrate(drawn: Drawn, directory: Path, lines: int, *, blur: bool = False) -> Calibration:
+    """Dark, flat, transfer, orientation, alignment, and if wanted the optics' blur."""
     taken = {kind: open_exposure(drawn.record(kind, directory, lines)) for kind in ("dark", "flat", "target")}
     first = dark(taken["dark"])
     known = Calibration(first.instrument).with_step(first)
     known = known.with_step(flat(taken["flat"], known))
     known = known.with_step(transfer([taken["flat"]], known))
     known = known.with_step(orientation(taken["target"], known))
-    return known.with_step(alignment(taken["target"], known))
+    known = known.with_step(alignment(taken["target"], known))
+    if not blur:
+        return known
+    return known.with_step(psf(open_exposure(drawn.record("edges", directory, lines)), known))
 
 
 def compared(drawn: Drawn, known: Calibration, directory: Path) -> dict[str, float]:
@@ -342,6 +358,7 @@ def main() -> None:
     parser.add_argument("--no-video", action="store_true")
     parser.add_argument("--orientations", action="store_true")
     parser.add_argument("--measured", action="store_true")
+    parser.add_argument("--psf", action="store_true")
     parser.add_argument("--json", type=Path)
     add_option(parser)
     options = parser.parse_args()
@@ -362,7 +379,7 @@ def instruments(options: argparse.Namespace, run: Run) -> None:
     for number, drawn in enumerate(chosen):
         with tempfile.TemporaryDirectory() as name:
             began = time.perf_counter()
-            known = calibrate(drawn, Path(name), options.lines)
+            known = calibrate(drawn, Path(name), options.lines, blur=options.psf)
             row = {"calibration_s": time.perf_counter() - began, **compared(drawn, known, Path(name))}
             if not options.no_video:
                 row |= pictures(drawn, known, Path(name))

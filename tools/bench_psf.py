@@ -26,19 +26,15 @@ from acquire.calibrate.exposure import open_exposure
 from acquire.calibrate.psf import psf, without_blur
 from acquire.forward import interpolation_variance, merge_video
 from acquire.recon import reconstruct
-from acquire.sim.media import VideoSceneConfig
 from acquire.sim.scenes import build_scene
 from acquire.store import open_recording
-from tools.bench_calibrate import NOISE, SEGMENT, Drawn, calibrate
+from tools.bench_calibrate import NOISE, SEGMENT, SIZE, Drawn, calibrate
 from tools.results import Run, add_option, recorded
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from acquire.config.scene import SceneConfig
     from acquire.lines import Segment
-
-SIZE, FINER = 192, 8
 
 
 class Blurred(Drawn):
@@ -55,27 +51,6 @@ class Blurred(Drawn):
         sharp = [each for each in super().effects if each["kind"] != "psf"]
         a, b = self.widths
         return [*sharp, {"kind": "psf", "sigma_pixels": a, "sigma_b_pixels": b}]
-
-    def scene(self, kind: str, effects: list[dict[str, Any]], directory: Path) -> SceneConfig:
-        if kind != "edges":
-            return super().scene(kind, effects, directory)
-        np.save(directory / "edges.npy", checkerboard(self.seed))
-        common = {"seed": self.seed, "system_gain_dn_per_e": 0.1, "effects": effects}
-        return VideoSceneConfig.model_validate({"kind": "video", "path": directory / "edges.npy", **common})
-
-    def rig(self, kind: str) -> Any:
-        return super().rig("target" if kind == "edges" else kind)
-
-
-def checkerboard(seed: int) -> NDArray[np.float32]:
-    """A turned checkerboard with squares of about 58 fine pixels; pixels hold the mean over their area."""
-    angle = np.deg2rad(np.random.default_rng(seed + 4000).uniform(3, 20))
-    at = (np.arange(SIZE * FINER) + 0.5) / FINER - SIZE / 2
-    y, x = np.meshgrid(at, at, indexing="ij")
-    u, v = y * np.cos(angle) + x * np.sin(angle), x * np.cos(angle) - y * np.sin(angle)
-    squares = (np.floor(3.3 * u / SIZE) + np.floor(3.3 * v / SIZE)) % 2
-    means = squares.reshape(SIZE, FINER, SIZE, FINER).mean(axis=(1, 3))
-    return np.asarray(means, np.float32)[None]
 
 
 def true_widths(drawn: Blurred) -> NDArray[np.float64]:
