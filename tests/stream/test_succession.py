@@ -216,7 +216,8 @@ def test_what_the_ring_could_not_hold_meanwhile_is_a_gap(config, tmp_path):
     causes = check(tmp_path / "r-2.zarr")
     assert {"ring_full"} <= causes <= {"recorder_lost", "ring_full"}
     assert check(tmp_path / "r.zarr") == set()
-    assert run.capture.poll().condition == "INCOMPLETE"
+    # on a busy host the successor may itself be ended before it has sealed: both ends tell of the loss
+    assert run.capture.poll().condition in ("INCOMPLETE", "INTERRUPTED")
 
 
 def test_what_is_killed_again_and_again_is_given_up(run, tmp_path, monkeypatch):
