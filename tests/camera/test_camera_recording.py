@@ -360,5 +360,5 @@ def test_a_fibre_through_gige_vision(tmp_path: Path) -> None:
     settings = [["remote", "Width", 104], ["remote", "PixelFormat", "Mono12"], ["remote", "Height", 100]]
     config = gige_config(**FIBRE | {f"cameras.{arm}.settings": settings for arm in "ab"})
     recording, status = record(config, tmp_path / "r.zarr", 3000)
-    assert status.condition is RunCondition.GOOD, status.lines
+    assert status.condition is RunCondition.GOOD, [event.text for event in recording.events]
     fibre_matches(config, recording)

@@ -216,8 +216,11 @@ def test_what_the_ring_could_not_hold_meanwhile_is_a_gap(config, tmp_path):
     causes = check(tmp_path / "r-2.zarr")
     assert {"ring_full"} <= causes <= {"recorder_lost", "ring_full"}
     assert check(tmp_path / "r.zarr") == set()
-    # on a busy host the successor may itself be ended before it has sealed: both ends tell of the loss
-    assert run.capture.poll().condition in ("INCOMPLETE", "INTERRUPTED")
+    # A slow host's successor starts with full rings and may be cut short by them; the reason must say so.
+    condition = run.capture.poll().condition
+    reason = open_recording(tmp_path / "r-2.zarr").attrs["end_reason"]
+    full = condition == "INTERRUPTED" and "too slow to write: the ring of arm" in reason
+    assert condition == "INCOMPLETE" or full, (condition, reason)
 
 
 def test_what_is_killed_again_and_again_is_given_up(run, tmp_path, monkeypatch):
