@@ -51,10 +51,17 @@ _START = "import sys; from acquire.processes import nursery; nursery.main(int(sy
 
 
 class Child:
-    """The owner's view of one worker process, which may not be forked yet; then its number is unknown."""
+    """The owner's view of one worker process, which may not be forked yet; then its number is unknown.
+
+    Any thread may ask.
+    """
 
     def __init__(self, status: socket.socket) -> None:
+        # Two threads may both find a message there, and only one of them gets it: the other must not wait for
+        # the next one, which comes at the process's end.
+        status.setblocking(False)
         self._status = status
+        self._receiving = threading.Lock()
         self._pidfd = -1
         self._pid: int | None = None
         self._exit_code: int | None = None
@@ -111,18 +118,21 @@ class Child:
         return False
 
     def _receive(self) -> None:
-        try:
-            word, fds, _, _ = socket.recv_fds(self._status, 64, 1, socket.MSG_CMSG_CLOEXEC)
-        except OSError:
-            word, fds = b"", []
-        if fds:
-            self._pid, self._pidfd = int(word), fds[0]
-            return
-        self._status.close()
-        if word:
-            self._exit_code = int(word)
-        elif self._pidfd < 0:
-            self._exit_code = UNKNOWN  # the nursery died before this process was forked
+        with self._receiving:
+            try:
+                word, fds, _, _ = socket.recv_fds(self._status, 64, 1, socket.MSG_CMSG_CLOEXEC)
+            except BlockingIOError:
+                return
+            except OSError:
+                word, fds = b"", []
+            if fds:
+                self._pid, self._pidfd = int(word), fds[0]
+                return
+            self._status.close()
+            if word:
+                self._exit_code = int(word)
+            elif self._pidfd < 0:
+                self._exit_code = UNKNOWN  # the nursery died before this process was forked
 
 
 class Nursery:

@@ -328,6 +328,8 @@ class Capture:
 
     def _waiting(self, supervisor: Supervisor) -> str:
         """Return what takes longer than it should, and for how long the rings can make up for it."""
+        if supervisor.still_s > REPORTED_S:  # then nothing else would be noticed, not even a process's death
+            return f"the supervisor has shown no life for {supervisor.still_s:.0f} s"
         if supervisor.silent_s > REPORTED_S:
             who = "disk has not answered" if supervisor.waits_for_disk else "recorder has shown no life"
             room = f"; {self._room()}" if supervisor.recording else ""

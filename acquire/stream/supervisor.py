@@ -80,7 +80,7 @@ class Supervisor:
         self._query_s = 0.0
         self._newest_pulse: int | None = None
         self._trigger_lost = False
-        self._trigger_heard_s = time.monotonic()
+        self._trigger_heard_s = self._turned_s = time.monotonic()
         self._events: deque[Note] = deque(maxlen=_MOST_EVENTS)
         self._dead: set[str] = set()
         self._hung: str | None = None
@@ -119,8 +119,13 @@ class Supervisor:
         """Seconds since the trigger's last tag or answer to a query."""
         return time.monotonic() - self._trigger_heard_s
 
+    @property
+    def still_s(self) -> float:
+        """How long this thread has shown no life: a driver of a trigger may not return."""
+        return 0.0 if self._ending.is_set() else time.monotonic() - self._turned_s
+
     def start(self) -> None:
-        self._trigger_heard_s = time.monotonic()
+        self._trigger_heard_s = self._turned_s = time.monotonic()
         self._thread.start()
 
     def end(self) -> None:
@@ -213,7 +218,7 @@ class Supervisor:
     def _run(self) -> None:
         try:
             while not self._ending.is_set():
-                begun = time.monotonic()
+                begun = self._turned_s = time.monotonic()
                 tags = self._take_tags()
                 self._query_trigger(begun)
                 for name, worker in self._workers.items():

@@ -6,6 +6,7 @@ import json
 import math
 import os
 import signal
+import socket
 import subprocess
 import sys
 import threading
@@ -19,7 +20,7 @@ from waiting import until
 
 from acquire.errors import AcquireError, DeviceError
 from acquire.processes.messages import Ready
-from acquire.processes.nursery import Nursery, Own, nursery
+from acquire.processes.nursery import Child, Nursery, Own, nursery
 from acquire.processes.shared import Counters
 from acquire.processes.worker import Mailbox, OwnerGone, Worker
 
@@ -183,6 +184,33 @@ def test_a_worker_that_was_not_born_yet_is_told() -> None:
     one.close()
     assert child.exit_code(LIMIT_S) == 255
     child.close()
+
+
+def test_any_number_of_threads_may_ask_for_a_number_that_is_just_coming() -> None:
+    """A status request beside the supervisor: one of them waited for the end of the process (83 of 300)."""
+    for _ in range(100):
+        ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        child = Child(ours)
+        asking = [threading.Thread(target=_ask, args=(child,)) for _ in range(4)]
+        for thread in asking:
+            thread.start()
+        time.sleep(0.002)
+        pidfd = os.pidfd_open(os.getpid())
+        socket.send_fds(theirs, [b"%d" % os.getpid()], [pidfd])
+        os.close(pidfd)
+        for thread in asking:
+            thread.join(LIMIT_S)
+        waiting = [thread for thread in asking if thread.is_alive()]
+        theirs.close()  # which frees those that wait
+        assert not waiting
+        assert child.pid() == os.getpid()
+        child.close()
+
+
+def _ask(child: Child) -> None:
+    deadline_s = time.monotonic() + LIMIT_S
+    while child.pid() is None:
+        assert time.monotonic() < deadline_s
 
 
 OWNER = """

@@ -8,6 +8,7 @@ import re
 import signal
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -426,6 +427,17 @@ def test_a_trigger_that_fails_is_a_fault(tmp_path: Path, error: Exception, fault
     recording, _ = check_rows(tmp_path / "r.zarr")
     assert recording.attrs["run_condition"] == "INTERRUPTED"
     assert recording.attrs["end_reason"] == fault
+
+
+def test_a_supervisor_that_its_trigger_holds_up_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    bench, returns = make_bench(), threading.Event()
+    with armed(bench) as capture:
+        tags = bench.trigger.tags
+        monkeypatch.setattr(bench.trigger, "tags", lambda limit_s: returns.wait(60) and tags(limit_s))
+        until(lambda: capture.poll().waiting.startswith("the supervisor has shown no life for "), "the words")
+        returns.set()
+        until(lambda: not capture.poll().waiting, "an answer")
+        assert capture.poll().fault is None
 
 
 @pytest.mark.parametrize(
