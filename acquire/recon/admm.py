@@ -42,7 +42,7 @@ class AdmmParameters:
     ``tv_weight`` is λ; ``tv_penalty`` and ``sign_penalty`` are the splits' ρ. ``preconditioned`` makes the
     data step nearly exact in a few gradient steps; without it the iterates reach weak details last, which
     suppresses noise as a higher weight would. The data step ends after ``gradient_steps``, or as soon as
-    ``gradient_share`` of the residual is left.
+    ``gradient_share`` of the residual is left. ``joint_tv`` is for coefficient frames with edges in common.
     """
 
     tv_weight: float = 1e-3
@@ -54,6 +54,7 @@ class AdmmParameters:
     tv_iterations: int = 10
     grid_per_coefficient: int = 1
     preconditioned: bool = False
+    joint_tv: bool = False
 
 
 class Admm:
@@ -78,7 +79,8 @@ class Admm:
         background: Array | None = None,
     ) -> None:
         self._samples, self._parameters, self._background = samples, parameters, background
-        self._denoiser = Checked(denoiser) if denoiser else FrameTv(parameters.tv_iterations)
+        tv = FrameTv(parameters.tv_iterations, joint=parameters.joint_tv)
+        self._denoiser = Checked(denoiser) if denoiser else tv
         self._xp, arrays = namespace(samples), basis.arrays
         self._emphasis = arrays.asarray(emphasis)
         self._strength = self._emphasis * (parameters.tv_weight / parameters.tv_penalty)

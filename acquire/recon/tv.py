@@ -13,7 +13,7 @@ from array_api_compat import is_numpy_array
 
 from acquire.arrays import namespace
 from acquire.errors import UsageError
-from acquire.recon.kernels import SMALLEST_WEIGHT, tv_prox, tv_value
+from acquire.recon.kernels import SMALLEST_WEIGHT, joint_tv_prox, tv_prox, tv_value
 
 if TYPE_CHECKING:
     from acquire.arrays import Array
@@ -23,30 +23,32 @@ LARGEST_WEIGHT = 1e6
 
 
 class FrameTv:
-    """Isotropic 2-D TV, frame by frame (Section 4 of the paper).
+    """Isotropic 2-D TV, frame by frame (Section 4 of the paper); ``joint``: of frames with common edges.
 
     ``prox`` is approximate: ``iterations`` of fast gradient projection from where the last call ended.
     """
 
-    def __init__(self, iterations: int) -> None:
+    def __init__(self, iterations: int, *, joint: bool = False) -> None:
         if iterations < 1:
             raise UsageError(f"the TV prox cannot have {iterations} iterations", possible="1 or more")
         self.iterations = iterations
+        self._joint = joint
         self._dual: Array = None
 
     def value(self, frames: Array) -> float:
-        """Σ_k TV(frames[k])."""
-        if is_numpy_array(frames):
+        """Σ_k TV(frames[k]); if joint, Σ over the pixels of √(Σ_k |∇frames[k]|²)."""
+        if is_numpy_array(frames) and not self._joint:
             values = np.empty(len(frames))
             tv_value(frames, values)
             return float(values.sum())
         xp = namespace(frames)
-        return float(xp.sum(xp.sqrt(ahead(frames, 1) ** 2 + ahead(frames, 2) ** 2), dtype=xp.float64))
+        squares = self._together(ahead(frames, 1) ** 2 + ahead(frames, 2) ** 2)
+        return float(xp.sum(xp.sqrt(squares), dtype=xp.float64))
 
     def prox(self, frames: Array, weight: float | Array) -> Array:
         """argmin_x ½‖x − frames‖² + Σ_k weight_k·TV(x_k); ``weight`` is one number or (K,).
 
-        All calls need frames of the same shape.
+        If joint, the second term is the `value` of weight_k·x_k. All calls need frames of the same shape.
         """
         xp = namespace(frames)
         capped = (
@@ -58,19 +60,24 @@ class FrameTv:
         if not is_numpy_array(frames):
             return self._prox_of_all(frames, weights)
         out = np.empty_like(frames)
-        tv_prox(frames, weights, self._dual, self.iterations, out)
+        (joint_tv_prox if self._joint else tv_prox)(frames, weights, self._dual, self.iterations, out)
         return out
+
+    def _together(self, squares: Array) -> Array:
+        """(k, r, c) of each frame, or (1, r, c) of all if they are joint."""
+        return namespace(squares).sum(squares, axis=0, keepdims=True) if self._joint else squares
 
     def _prox_of_all(self, frames: Array, weights: Array) -> Array:
         """As `kernels.tv_prox`; p is the dual's part along the rows' axis, q that along the columns'."""
         xp, scale = namespace(frames), weights[:, None, None]
         used = xp.maximum(scale, SMALLEST_WEIGHT)
+        step = used / (8 * (xp.max(used) if self._joint else used) ** 2)
         p, q = self._dual[:, 0, ...], self._dual[:, 1, ...]
         p_ahead, q_ahead, momentum = p, q, 1.0
         for _ in range(self.iterations):
             x = frames + used * _divergence(p_ahead, q_ahead)
-            new_p, new_q = p_ahead + ahead(x, 1) / (8 * used), q_ahead + ahead(x, 2) / (8 * used)
-            length = xp.maximum(xp.sqrt(new_p**2 + new_q**2), 1)
+            new_p, new_q = p_ahead + step * ahead(x, 1), q_ahead + step * ahead(x, 2)
+            length = xp.maximum(xp.sqrt(self._together(new_p**2 + new_q**2)), 1)
             new_p, new_q = new_p / length, new_q / length
             following = (1 + math.sqrt(1 + 4 * momentum**2)) / 2
             push, momentum = (momentum - 1) / following, following

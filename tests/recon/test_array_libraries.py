@@ -113,11 +113,12 @@ def test_the_band_operator_and_its_transpose(case: tuple[Geometry, int, int, int
     np.testing.assert_allclose(host(there.adjoint(STRICT.asarray(lines))), here.adjoint(lines), atol=1e-11)
 
 
+@pytest.mark.parametrize("joint", [False, True])
 @pytest.mark.parametrize("weight", [0.0, 1e-30, 0.1, np.array([0.0, 0.05, 3.0]), 1e8])
-def test_total_variation_is_that_of_the_compiled_loops(weight: float | np.ndarray) -> None:
+def test_total_variation_is_that_of_the_compiled_loops(weight: float | np.ndarray, *, joint: bool) -> None:
     """It is compared over three calls, each of which continues the dual field of the last."""
     frames = np.random.default_rng(2).random((3, 9, 7))
-    here, there = FrameTv(10), FrameTv(10)
+    here, there = FrameTv(10, joint=joint), FrameTv(10, joint=joint)
     given = weight if isinstance(weight, float) else STRICT.asarray(weight)
     assert there.value(STRICT.asarray(frames)) == pytest.approx(here.value(frames))
     for shift in (0.0, 0.1, 0.2):

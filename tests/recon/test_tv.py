@@ -60,6 +60,36 @@ def test_frames_are_independent_and_warm_starts_reach_the_same_point() -> None:
     np.testing.assert_allclose(last, together, atol=1e-5)
 
 
+def test_frames_with_edges_in_common_move_as_one_vector() -> None:
+    """A step of (3, 4) loses height as one of 5 would, in its own direction, whatever the frames' basis."""
+    step = np.zeros((1, 6, 10))
+    step[:, :, 5:] = 1.0
+    lower = prox(5 * step, 0.5) / 5
+    tv = FrameTv(3000, joint=True)
+    np.testing.assert_allclose(tv.prox(np.concatenate([3 * step, 4 * step]), 0.5)[1], 4 * lower[0], atol=1e-6)
+    assert FrameTv(1, joint=True).value(np.concatenate([3 * step, 4 * step])) == pytest.approx(5 * 6)
+    frames, turn = np.random.default_rng(3).random((2, 9, 8)), np.array([[0.6, -0.8], [0.8, 0.6]])
+    turned = FrameTv(3000, joint=True).prox(np.tensordot(turn, frames, axes=1), 0.2)
+    there = FrameTv(3000, joint=True).prox(frames, 0.2)
+    np.testing.assert_allclose(turned, np.tensordot(turn, there, axes=1), atol=1e-5)
+    alone = FrameTv(3000, joint=True).prox(frames[:1], 0.2)
+    np.testing.assert_allclose(alone, prox(frames[:1], 0.2), atol=1e-9)
+
+
+def test_frames_with_edges_in_common_minimise_what_is_said() -> None:
+    generator = np.random.default_rng(4)
+    frames, weights = generator.random((3, 10, 12)), np.array([0.1, 0.3, 0.05])
+    value = FrameTv(1, joint=True).value
+
+    def objective(x: np.ndarray) -> float:
+        return 0.5 * float(((x - frames) ** 2).sum()) + value(weights[:, None, None] * x)
+
+    found = FrameTv(3000, joint=True).prox(frames, weights)
+    for _ in range(20):
+        assert objective(found) <= objective(found + 1e-3 * generator.standard_normal(frames.shape))
+    assert objective(found) < objective(prox(frames, 0.1))
+
+
 def test_value_of_a_disc_edge_and_refusal() -> None:
     frame = np.zeros((2, 5, 5))
     frame[1, 2, 2] = 1.0  # three forward differences: right-below corner √2, left 1, above 1
