@@ -20,7 +20,7 @@ from acquire.recon.band import band_operator
 from acquire.recon.bandwidth import FEWEST_COEFFICIENTS, MARGIN, estimate_coefficients, light_beyond
 from acquire.recon.basis import TemporalBasis, resized
 from acquire.recon.estimates import InBand, Refined
-from acquire.recon.patterns import ROUND, Refinement, find_patterns
+from acquire.recon.patterns import LEAST_NEED, ROUND, Refinement, find_patterns
 
 if TYPE_CHECKING:
     from acquire.arrays import Array
@@ -63,9 +63,8 @@ PATIENCE = 6
 """Number of rounds without improvement that end a refinement."""
 TRIAL_ROUNDS = 2
 """Number of rounds after which superfluous patterns are recognised."""
-LONGEST_TRIAL, IN_DOUBT = 2, 0.1
-"""Largest number of times that as many rounds are made without them, and the relative rise of the held-out
-error up to which they are made again."""
+LONGEST_TRIAL = 2
+"""Largest number of times that as many rounds are made without them."""
 LOOSENED_IN_VAIN = 3
 """Number of rounds without improvement after which λ is no longer lowered: noise is being fitted."""
 TIGHTER = 2.0
@@ -237,8 +236,9 @@ def _with_needed_patterns(refinement: Refinement, problem: Problem, clock: Itera
     """The refinement after a few rounds, without superfluous patterns.
 
     The first look tells patterns from its own errors by their energy alone, and may find too many. Without
-    the doubtful ones, the held-out samples must be predicted as well after equally many rounds, or nearly as
-    well after a few and as well after more, since the other patterns have to take their light back first.
+    the doubtful ones, the held-out samples must be predicted as well after equally many rounds, or not much
+    worse after a few and as well after more, since the other patterns have to take their light back first.
+    In these rounds the held-out error still rises and falls by a fifth.
     """
 
     def refine(start: Refinement) -> float:
@@ -255,7 +255,7 @@ def _with_needed_patterns(refinement: Refinement, problem: Problem, clock: Itera
         without, error = refine(fewer), refine(refinement)
         if without <= error:
             return fewer
-        if without > (1 + IN_DOUBT) * error:
+        if without > (1 + LEAST_NEED) * error:
             break
     return refinement
 

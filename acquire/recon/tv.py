@@ -68,7 +68,7 @@ class FrameTv:
         return namespace(squares).sum(squares, axis=0, keepdims=True) if self._joint else squares
 
     def _prox_of_all(self, frames: Array, weights: Array) -> Array:
-        """As `kernels.tv_prox`; p is the dual's part along the rows' axis, q that along the columns'."""
+        """As the compiled loops; p is the dual's part along the rows' axis, q that along the columns'."""
         xp, scale = namespace(frames), weights[:, None, None]
         used = xp.maximum(scale, SMALLEST_WEIGHT)
         step = used / (8 * (xp.max(used) if self._joint else used) ** 2)

@@ -124,10 +124,10 @@ def test_what_is_closed_between_two_segments_is_sealed_already(tmp_path: Path) -
 
         def pauses() -> bool:
             due_s = life.resumption._due_s
-            return life.stage is Stage.PAUSED and due_s is not None and due_s > time.monotonic() + 1.0
+            lasts = life.stage is Stage.PAUSED and due_s is not None and due_s > time.monotonic() + 1.0
+            return lasts and capture.poll().waiting.startswith(MEANINGS[Stage.PAUSED])
 
-        until(pauses, "a pause that lasts")
-        assert capture.poll().waiting.startswith(MEANINGS[Stage.PAUSED])
+        until(pauses, "a pause that lasts, and is told")
         capture.close()  # nothing is left to be sealed: it must not wait for it, and fail
         seen = capture.poll()
     assert (seen.recording, seen.done, seen.orphans) == (False, True, ())
