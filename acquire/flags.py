@@ -23,3 +23,7 @@ class LineFlag(IntFlag):
     """No tag of the trigger confirmed the code index; it is extrapolated."""
     CODE_CONTRADICTED = 32
     """The arm's lines did not follow the code that they are tagged with (`acquire.stream.lightcheck`)."""
+
+
+NO_IMAGE = LineFlag.MISSING | LineFlag.INCOMPLETE
+"""Flags of lines whose pixels mean nothing: zeros, or in part those of an earlier line."""

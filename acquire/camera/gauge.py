@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from acquire.lines import LineFlag
+from acquire.flags import NO_IMAGE
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -16,7 +16,6 @@ MOST_PIXELS = 2**15
 """Number of pixels of a block that are used, in whole lines spread over it."""
 FAINT = 0.01
 """Level, relative to white, below which sharpness would be that of the noise."""
-_NO_IMAGE = LineFlag.MISSING | LineFlag.INCOMPLETE
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,7 +69,7 @@ class Gauge:
 
     def look(self, pixels: NDArray[Any], flags: NDArray[np.uint16], lost: int = 0) -> Sums:
         """Return the sums of consecutive lines (line, pixel) and flags (line) after ``lost`` lost ones."""
-        good = (flags & _NO_IMAGE) == 0
+        good = (flags & NO_IMAGE) == 0
         sums = Sums(int(good.sum()), lost + int(len(flags) - good.sum()))
         stride = max(1, -(-pixels.size // MOST_PIXELS))
         seen = pixels[::stride][good[::stride]].astype(np.int32)

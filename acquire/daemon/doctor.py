@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 
 from acquire import __version__
+from acquire.camera.aravis.stream import RECEIVE_BYTES
 from acquire.cores import usable_cores
 from acquire.lines import ARMS
 from acquire.plugins import GROUPS, OURS
@@ -31,8 +32,6 @@ if TYPE_CHECKING:
 
 Level = Literal["good", "warning", "bad"]
 LEAST_DESCRIPTORS = 4096
-GIGE_RECEIVE_BYTES = 32 * 2**20
-"""Size of a socket's buffer: part of the packets of a tenth of a second at 10 Gbit/s."""
 USB_BUFFER_MB = 1000
 DISK_GB = 50.0
 """Less than this is soon full."""
@@ -236,10 +235,10 @@ def _network(rig: RigConfig | None) -> Iterator[Finding]:
         return
     most = int(_read(Path("/proc/sys/net/core/rmem_max")) or 0)
     text = f"a socket may buffer {most / 2**20:.1f} MiB"
-    if most >= GIGE_RECEIVE_BYTES:
+    if most >= RECEIVE_BYTES:
         yield Finding("network", "good", text)
     else:
-        yield Finding("network", "warning", text, f"sysctl -w net.core.rmem_max={GIGE_RECEIVE_BYTES}")
+        yield Finding("network", "warning", text, f"sysctl -w net.core.rmem_max={RECEIVE_BYTES}")
 
 
 def _usb(rig: RigConfig | None) -> Iterator[Finding]:

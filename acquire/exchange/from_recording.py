@@ -10,7 +10,7 @@ import numpy as np
 from acquire import __version__
 from acquire.errors import UsageError
 from acquire.exchange.content import Array, Axis, Block, Content, block, little
-from acquire.lines import ARMS, LineFlag
+from acquire.flags import ARMS, NO_IMAGE, LineFlag
 from acquire.store.present import MISSING, flags_of, present_values
 
 if TYPE_CHECKING:
@@ -133,15 +133,17 @@ def _place(rows: range, start: int, stop: int) -> slice:
 
 
 def _all_flags(flags: NDArray[np.uint16], count: int) -> NDArray[np.uint16]:
-    """Combine the flags of each group of ``count`` lines; it is ``missing`` only if all of them are."""
+    """Combine the flags of each group of ``count`` lines; it has no image only if none of them has one."""
     edges = np.arange(0, len(flags), count)
-    found: NDArray[np.uint16] = np.bitwise_or.reduceat(flags & ~MISSING, edges)
-    return found | np.bitwise_and.reduceat(flags & MISSING, edges)
+    found: NDArray[np.uint16] = np.bitwise_or.reduceat(flags, edges)
+    has_image = np.logical_or.reduceat((flags & NO_IMAGE) == 0, edges)
+    return np.where(has_image, found & ~np.uint16(NO_IMAGE), found)
 
 
 def _means(lines: NDArray[Any], flags: NDArray[np.uint16], count: int) -> NDArray[np.float32]:
-    """Return the mean of each group of ``count`` lines without the missing ones, which are 0."""
+    """Return the mean of each group of ``count`` lines without those that have no image; 0 if none has."""
     edges = np.arange(0, len(lines), count)
-    total = np.add.reduceat(lines, edges, axis=0, dtype=np.float64)  # a sum of uint16 would overflow
-    there = np.add.reduceat((flags & MISSING) == 0, edges, dtype=np.int64)
+    there = (flags & NO_IMAGE) == 0
+    total = np.add.reduceat(np.where(there[:, None], lines, 0), edges, axis=0, dtype=np.float64)
+    there = np.add.reduceat(there, edges, dtype=np.int64)
     return (total / np.maximum(there, 1)[:, None]).astype(np.float32)

@@ -102,6 +102,7 @@ def _sights(segment: Segment) -> dict[str, Sight]:
     sights = {}
     for name, lines, mask, level in zip(ARMS, segment.lines, segment.mask, black, strict=True):
         dn = np.where(mask, lines - level, 0.0)
-        per_line, per_column = np.maximum(mask.sum(1), 1), np.maximum(mask.sum(0), 1)
-        sights[name] = Sight(dn.sum(1) / per_line, dn.sum(0) / per_column)
+        per_line, per_column = mask.sum(1), np.maximum(mask.sum(0), 1)
+        energy = np.where(per_line > 0, dn.sum(1) / np.maximum(per_line, 1), np.nan)
+        sights[name] = Sight(energy, dn.sum(0) / per_column)
     return sights

@@ -15,6 +15,7 @@ import numpy as np
 from acquire.clock import NS_PER_S
 from acquire.codes import code_from_attrs
 from acquire.errors import DataError, UsageError
+from acquire.flags import NO_IMAGE
 from acquire.lines import ARMS, LineFlag, Segment
 from acquire.noise import Noise
 from acquire.showing import PICTURE_PX, as_picture, as_table, in_words
@@ -41,7 +42,6 @@ CUT_COLUMNS = ("lines", "flags", "code", "code_index", "time")
 """Arrays from which a segment is cut."""
 
 NOISE_KEYS = ("dn_per_electron", "read_noise_e")
-UNUSABLE = LineFlag.MISSING | LineFlag.INCOMPLETE
 
 
 def open_recording(place: Path | str) -> Recording:
@@ -256,7 +256,7 @@ class Recording(Outline):
         usable = np.empty(samples.shape, np.bool_)
         for arm, white in enumerate(self._camera_numbers("white_dn")):
             np.less(samples[arm], math.ceil(white), out=usable[arm])  # integer comparison: many times faster
-        usable[(flags & UNUSABLE) != 0] = False
+        usable[(flags & NO_IMAGE) != 0] = False
         return usable
 
     def _checked_code(

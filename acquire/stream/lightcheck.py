@@ -63,7 +63,7 @@ class Verdict(StrEnum):
 class Sight:
     """Means of consecutive lines of one arm, above the black level, in DN.
 
-    ``energy`` (line): mean of each line; ``profile`` (pixel): mean of each pixel.
+    ``energy`` (line): mean of each line, NaN if it has no image; ``profile`` (pixel): mean of each pixel.
     """
 
     energy: NDArray[np.float64]
@@ -134,22 +134,23 @@ class Judge:
     def _judge(
         self, sight: Sight, rows: NDArray[np.float64], bits: NDArray[np.uint8], nominal: int
     ) -> Finding:
-        # Darkness is judged first: noise correlates with anything. It is expected if the code leaves the
-        # light off for all of these lines.
-        least = _DARK_SHARE * self.white_dn
-        light = float(sight.energy.mean())
-        if light < least and bits.any():
-            return Finding(Verdict.DARK)
-        # A constant code, or a dark other arm, predicts no variation.
-        if bits.min() == bits.max() or rows.mean() < least:
-            return Finding(Verdict.UNKNOWN)
+        light, least = float(np.nanmean(sight.energy)), _DARK_SHARE * self.white_dn
+        # Darkness is expected if the code leaves the light off for all of these lines.
+        dark = Finding(Verdict.DARK if light < least and bits.any() else Verdict.UNKNOWN)
+        # A constant code, or an arm without light, predicts no variation.
+        if bits.min() == bits.max() or min(light, rows.mean()) <= 0:
+            return dark
         predicted = predict(rows, bits, self.substeps)
         predicted *= light / predicted.mean()
         # Differences from line to line: slow changes of a lamp or the scene drop out, and the code remains.
         steps = predicted[self.substeps :] - predicted[: -self.substeps]
         seen = np.diff(sight.energy)
-        contrast = float(steps.std() / max(seen.std(), _NEVER_ZERO))
-        return _read(_correlate(seen, steps, self.substeps), nominal, contrast, len(seen))
+        known = np.isfinite(seen)
+        contrast = float(steps.std() / max(seen[known].std(), _NEVER_ZERO))
+        found = _read(_correlate(seen, known, steps, self.substeps), nominal, contrast, int(known.sum()))
+        # Noise in the dark may correlate with anything, but by chance not at the expected delay.
+        is_lit = min(light, rows.mean()) >= least
+        return found if is_lit or found.verdict is Verdict.VERIFIED else dark
 
 
 def predict(rows: NDArray[np.float64], bits: NDArray[np.uint8], substeps: int) -> NDArray[np.float64]:
@@ -164,14 +165,16 @@ def predict(rows: NDArray[np.float64], bits: NDArray[np.uint8], substeps: int) -
     return energy
 
 
-def _correlate(seen: NDArray[Any], steps: NDArray[Any], substeps: int) -> NDArray[np.float64]:
-    """Correlate ``seen`` (one value per line) with ``steps`` (predicted, one per sub-step) at all delays."""
+def _correlate(
+    seen: NDArray[Any], known: NDArray[np.bool_], steps: NDArray[Any], substeps: int
+) -> NDArray[np.float64]:
+    """Correlate ``seen``, one value per line, with ``steps`` (predicted, one per sub-step) at all delays."""
     spread = np.zeros(substeps * len(seen))
-    spread[::substeps] = seen - seen.mean()
+    spread[::substeps] = np.where(known, seen - seen[known].mean(), 0.0)
     size = _transform_size(len(steps))
     product = np.conj(np.fft.rfft(spread, size)) * np.fft.rfft(steps, size)
     raw = np.fft.irfft(product, size)[: len(steps) - len(spread) + 1]
-    scale = seen.std() * steps.std() * np.sqrt(len(seen))
+    scale = seen[known].std() * steps.std() * np.sqrt(known.sum())
     deviations: NDArray[np.float64] = raw / max(scale, _NEVER_ZERO)
     return deviations
 

@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from acquire.flags import NO_IMAGE
+
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
@@ -32,19 +34,23 @@ class Threshold:
         self.plan = plan
         self._beyond: bool | None = None
 
-    def crossings(self, first_line: int, pixels: NDArray[Any]) -> list[int]:
-        """Return the first line of every averaged group in ``pixels`` (line, pixel) that has a crossing."""
+    def crossings(self, first_line: int, pixels: NDArray[Any], flags: NDArray[np.uint16]) -> list[int]:
+        """Return the first line of every averaged group in ``pixels`` (line, pixel) that has a crossing.
+
+        Lines without an image, by their ``flags``, have no part in the means.
+        """
         plan, sign = self.plan, 1.0 if self.plan.rising else -1.0
         found = []
         # Means of average_lines lines each, and of the remainder, over some of the columns: a threshold needs
         # no more, and all columns of a wide sensor would take a processor.
         step = -(-pixels.shape[1] // _MOST_COLUMNS)
         levels = pixels[:, ::step].mean(axis=1, dtype=np.float32)
+        usable = (flags & NO_IMAGE) == 0
         starts = np.arange(0, len(levels), plan.average_lines)
-        counts = np.diff(starts, append=len(levels))
-        means: list[float] = (np.add.reduceat(levels, starts) / counts).tolist()
-        for number, mean_dn in enumerate(means):
-            above = sign * (mean_dn - plan.level_dn)
+        counts = np.add.reduceat(usable, starts, dtype=np.int64)
+        totals = np.add.reduceat(np.where(usable, levels, 0), starts)
+        for number in np.flatnonzero(counts).tolist():
+            above = sign * (float(totals[number] / counts[number]) - plan.level_dn)
             if above >= 0 and self._beyond is False:
                 found.append(first_line + number * plan.average_lines)
             if above >= 0:

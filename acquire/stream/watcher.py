@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from acquire.lines import ARMS
+from acquire.flags import ARMS, NO_IMAGE
 from acquire.processes.messages import Ready
 from acquire.store.suspect import DOUBTFUL, VERIFIED
 from acquire.stream.lightcheck import Finding, Judge, Sight, Verdict, explain
@@ -129,7 +129,9 @@ class Watcher:
         if threshold is None and (intake is None or intake.full):
             observer.skip()
         while (block := observer.acquire()) is not None:
-            crossed = [] if threshold is None else threshold.crossings(block.first_line, block.pixels)
+            crossed = []
+            if threshold is not None:
+                crossed = threshold.crossings(block.first_line, block.pixels, block.flags)
             if intake is not None:
                 intake.take(block)
             if observer.release():
@@ -188,13 +190,17 @@ class Watcher:
 
 
 class Intake:
-    """Means of ``lines`` consecutive lines of one arm from ``first_line`` on, as the check needs them."""
+    """Means of ``lines`` consecutive lines of one arm from ``first_line`` on, as the check needs them.
+
+    Lines that were lost, overwritten unread or damaged are left out. `broken`: if these are more than half,
+    or a block was overwritten while it was read; the check cannot be made.
+    """
 
     def __init__(self, first_line: int, lines: int, black_dn: float) -> None:
         self.first_line = first_line
         self.broken = False
-        self._energy = np.empty(lines)
-        self._count = 0
+        self._energy = np.full(lines, np.nan)
+        self._count = self._seen = 0
         self._black_dn = black_dn
         self._profile: list[NDArray[np.float64]] = []
         self._profile_step = max(1, lines // _MOST_PROFILE_LINES)
@@ -204,20 +210,26 @@ class Intake:
         return self._count == len(self._energy) and not self.broken
 
     def take(self, block: RingBlock) -> None:
-        """Add the block's lines. A lost line sets `broken`: the check cannot be made."""
-        expected = self.first_line + self._count
-        if self.broken or self.full or block.end_line <= expected:
+        """Add the block's lines, and those lost before it."""
+        if self.broken or self.full or block.end_line <= self.first_line + self._count:
             return
-        if block.first_line > expected:
-            self.broken = True
-            return
-        pixels = block.pixels[expected - block.first_line :][: len(self._energy) - self._count]
+        lost = max(0, block.first_line - self.first_line - self._count)
+        self._count = min(self._count + lost, len(self._energy))
+        start = self.first_line + self._count - block.first_line
+        part = slice(start, start + len(self._energy) - self._count)
+        usable = (block.flags[part] & NO_IMAGE) == 0
+        pixels = block.pixels[part]
+        if not usable.all():
+            pixels = pixels[usable]
         # Evenly spaced columns and lines: the mean of all would take a processor at 100 kHz, and the code
         # shows in any part of the line.
         energy = pixels[:, :: -(-pixels.shape[1] // _MOST_COLUMNS)].mean(axis=1)
-        self._energy[self._count : self._count + len(energy)] = energy
-        self._count += len(energy)
-        self._profile.append(pixels[:: self._profile_step].mean(axis=0, dtype=np.float64))
+        self._energy[self._count + np.flatnonzero(usable)] = energy
+        self._count += len(usable)
+        self._seen += len(energy)
+        if len(energy):
+            self._profile.append(pixels[:: self._profile_step].mean(axis=0, dtype=np.float64))
+        self.broken = self.full and 2 * self._seen < len(self._energy)
 
     def sight(self) -> Sight:
         """Return the means of the lines and of the pixels, above the black level."""

@@ -16,7 +16,7 @@ import numpy as np
 from PIL import Image
 
 from acquire.errors import AcquireError, PlaceError, UsageError
-from acquire.lines import ARMS, LineFlag
+from acquire.flags import ARMS, NO_IMAGE
 from acquire.store import Recording, format_of, hold, open_recording, open_video
 from acquire.store.layout import DAMAGE
 from acquire.store.shortfall import first_shortfall, missing_segments
@@ -234,11 +234,11 @@ def _arm_overview(opened: Recording, arm: str) -> NDArray[np.uint8]:
             picture[row] = LOST_COLOUR
             continue
         lines, flags = stream.read("lines", start, stop), stream.read("flags", start, stop)
-        missing = (flags & LineFlag.MISSING) != 0
-        if missing.all():
+        no_image = (flags & NO_IMAGE) != 0
+        if no_image.all():
             picture[row] = LOST_COLOUR
             continue
-        brightest = np.maximum.reduceat(lines[~missing].max(axis=0).astype(np.float64), edges)
+        brightest = np.maximum.reduceat(lines[~no_image].max(axis=0).astype(np.float64), edges)
         picture[row] = np.clip(brightest * (255 / white), 0, 255).astype(np.uint8)[:, None]
     return picture[: max(rows, 1)]
 

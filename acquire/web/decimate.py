@@ -12,6 +12,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from acquire.flags import NO_IMAGE
+
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
@@ -86,6 +88,8 @@ class Decimator:
         self._edges = np.arange(count) * width // count
         self._row: _Row | None = None
         self._next_line: int | None = None
+        self._lost = False
+        """Whether lines were lost since `_next_line`."""
         self._done = _Done()
         self._waiting: list[tuple[NDArray[np.int64], NDArray[Any]]] = []
         self._histogram = np.zeros(BINS, np.int64)
@@ -102,18 +106,31 @@ class Decimator:
         return np.arange(start + -start % stride, first_line + count, stride)
 
     def add(
-        self, first_line: int, count: int, lines: NDArray[np.int64], pixels: NDArray[Any], *, lost: bool
+        self,
+        first_line: int,
+        flags: NDArray[np.uint16],
+        lines: NDArray[np.int64],
+        pixels: NDArray[Any],
+        *,
+        lost: bool,
     ) -> None:
-        """Add a block of ``count`` lines; ``pixels`` (line, pixel) are those of the sampled ``lines``.
+        """Add a block of lines with ``flags``; ``pixels`` (line, pixel) are those of the sampled ``lines``.
 
-        ``lost``: the lines just before it were lost, and not merely unseen.
+        ``lost``: the lines just before it were lost, and not merely unseen. Lines without an image are lost.
         """
-        if self._next_line is not None and first_line > self._next_line:
-            self._reduce()
-            self._skip_to(first_line, LOST if lost else UNSEEN)
-        self._next_line = max(first_line + count, self._next_line or 0)
-        if len(lines):
-            self._waiting.append((lines, pixels))
+        self._lost |= lost
+        usable = (flags & NO_IMAGE) == 0
+        for start, stop in np.flatnonzero(np.diff(usable, prepend=False, append=False)).reshape(-1, 2):
+            begin, end = first_line + int(start), first_line + int(stop)
+            if self._next_line is not None and begin > self._next_line:
+                self._reduce()
+                self._skip_to(begin, LOST if self._lost else UNSEEN)
+            self._next_line = max(end, self._next_line or 0)
+            here = (lines >= begin) & (lines < end)
+            if here.any():
+                self._waiting.append((lines[here], pixels[here]))
+            self._lost = False
+        self._lost |= not usable[-1]
 
     def take(self) -> Rows | None:
         """Return the rows completed since the last call."""

@@ -26,7 +26,8 @@ from acquire.config import RigConfig
 from acquire.cores import limit_blas
 from acquire.errors import AcquireError
 from acquire.fibre import Tile
-from acquire.lines import ARMS, LineFlag, Segment
+from acquire.flags import NO_IMAGE
+from acquire.lines import ARMS, Segment
 from acquire.recon import reconstruct
 from acquire.stream.peek import Peek
 from acquire.web.frames import message
@@ -99,7 +100,7 @@ class Glimpses:
         samples = np.stack([each[0][:, columns] for each, columns in pairs if each is not None])
         flags = np.stack([each[1] for each in ranges if each is not None])
         usable: NDArray[np.bool_] = samples < config.cameras.a.white_dn
-        usable[(flags & (LineFlag.MISSING | LineFlag.INCOMPLETE)) != 0] = False
+        usable[(flags & NO_IMAGE) != 0] = False
         geometry = config.geometry.segment(lines)
         substeps = config.geometry.substeps
         period_ns = 1e9 / config.line_rate_hz

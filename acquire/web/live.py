@@ -142,13 +142,13 @@ class _ArmReader:
             block = self._peek.next()
             if block is None:
                 break
-            first_line, count, lost = block.first_line, len(block.flags), bool(block.losses)
-            lines = self._decimator.sampled_lines(first_line, count)
+            first_line, flags, lost = block.first_line, block.flags.copy(), bool(block.losses)
+            lines = self._decimator.sampled_lines(first_line, len(flags))
             pixels = block.pixels[lines - first_line]  # a copy, because the block may be overwritten any time
             newest_ns = block.time_ns
             del block  # a view of the ring would keep its memory mapped
             if self._peek.took():  # the block was not overwritten while it was copied
-                self._decimator.add(first_line, count, lines, pixels, lost=lost)
+                self._decimator.add(first_line, flags, lines, pixels, lost=lost)
         rows = self._decimator.take()
         if rows is None:
             return None

@@ -5,11 +5,13 @@ from __future__ import annotations
 import ctypes
 import time
 from collections.abc import Iterator
+from pathlib import Path
 
 import pytest
 from gige_helpers import WAIT_S, open_in_time, our_camera, spec_at
 
 from acquire.camera.aravis import FAKE, AravisCamera, AravisOpener, load
+from acquire.camera.aravis.stream import RECEIVE_BYTES
 from acquire.camera.settings import Setting, apply_settings
 from acquire.camera.spec import GenicamSpec
 from acquire.errors import CameraError
@@ -158,6 +160,8 @@ def test_a_frame_is_waited_for_as_long_as_its_lines_take(
     camera.close()
     assert (found["packet-timeout"], found["frame-retention"]) == (timeout_us, retention_us)
     assert found["packet-resend"] == "always"
+    largest = int(Path("/proc/sys/net/core/rmem_max").read_text())
+    assert (found["socket-buffer"], found["socket-buffer-size"]) == ("fixed", min(largest, RECEIVE_BYTES))
 
 
 @pytest.mark.parametrize(

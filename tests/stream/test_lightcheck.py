@@ -108,6 +108,28 @@ def test_a_known_registration_is_no_shift() -> None:
     assert {finding.verdict for finding in judge.look(FIRST, sights(lines)).values()} == {Verdict.VERIFIED}
 
 
+@pytest.mark.parametrize("scene", SCENES)
+def test_lines_without_an_image_are_left_out(scene: str) -> None:
+    lines, stages, substeps, white, code = recorded(scene)
+    seen = sights(lines)
+    for number, sight in enumerate(seen.values()):
+        sight.energy[np.random.default_rng(number).random(LINES // 64).repeat(64) < 0.3] = np.nan
+    for late, verdict in ((0, Verdict.VERIFIED), (-2, Verdict.SHIFTED)):
+        found = Judge(stages, substeps, Altered(code, late=late), white, {}).look(FIRST, seen)
+        assert {(each.verdict, each.shift) for each in found.values()} == {(verdict, -late)}
+
+
+@pytest.mark.parametrize("scene", SCENES)
+def test_faint_light_that_follows_the_code_is_not_dark(scene: str) -> None:
+    lines, stages, substeps, white, code = recorded(scene)
+    brightest = max(pixels.mean() for pixels in lines.values())
+    faint = {arm: np.round(pixels * (0.001 * white / brightest)) for arm, pixels in lines.items()}
+    found = Judge(stages, substeps, code, white, {}).look(FIRST, sights(faint))
+    assert {finding.verdict for finding in found.values()} == {Verdict.VERIFIED}
+    other = Judge(stages, substeps, Altered(code, late=-3), white, {}).look(FIRST, sights(faint))
+    assert {finding.verdict for finding in other.values()} == {Verdict.DARK}
+
+
 def test_dark_light_sources_are_told() -> None:
     lines, stages, substeps, white, code = recorded("scene-usaf")
     rng = np.random.default_rng(3)

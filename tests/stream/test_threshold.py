@@ -2,20 +2,26 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
+from acquire.flags import LineFlag
 from acquire.stream.threshold import Threshold, ThresholdPlan
 
 
-def crossings(levels: list[int], block_lines: int, **plan: object) -> list[int]:
+def crossings(levels: list[int], block_lines: int, damaged: Sequence[int] = (), **plan: object) -> list[int]:
     given = {"level_dn": 50.0, "hysteresis_dn": 10.0, "rising": True, "average_lines": 1}
     threshold = Threshold(ThresholdPlan("a", **(given | plan)))
     pixels = np.repeat(np.array(levels, np.uint16)[:, None], 100, axis=1)
+    flags = np.zeros(len(levels), np.uint16)
+    flags[list(damaged)] = LineFlag.INCOMPLETE
     found: list[int] = []
     for at in range(0, len(levels), block_lines):
-        found += threshold.crossings(1000 + at, pixels[at : at + block_lines])
+        part = slice(at, at + block_lines)
+        found += threshold.crossings(1000 + at, pixels[part], flags[part])
     return found
 
 
@@ -35,6 +41,12 @@ def test_falling() -> None:
 def test_means_of_lines() -> None:
     assert crossings([0, 0, 90, 0, 90, 90], 6, average_lines=2) == [1004]
     assert crossings([0, 0, 90, 0, 90], 5, average_lines=2) == [1004]  # what remains counts, too
+
+
+def test_lines_without_an_image_cross_nothing() -> None:
+    assert crossings([0, 90, 0, 0, 90, 0], 3, damaged=[1]) == [1004]
+    assert crossings([90, 0, 0, 90, 90, 90], 6, damaged=[0], average_lines=2) == [1004]
+    assert crossings([0, 40, 50, 90], 4, damaged=range(4)) == []
 
 
 @given(st.lists(st.integers(0, 100), max_size=60), st.integers(1, 20), st.booleans())

@@ -9,7 +9,7 @@ import pytest
 from test_lightcheck import Altered, recorded
 from test_recorder import Post
 
-from acquire.lines import ARMS
+from acquire.flags import ARMS, LineFlag
 from acquire.processes.shared import Counters
 from acquire.stream.lightcheck import Judge, Verdict
 from acquire.stream.messages import Checked, Note
@@ -37,22 +37,24 @@ class Bed:
         self.watcher = Watcher(self.post, plan, self.rings, self.counters)
         self.now_s = 0.0
 
-    def pass_by(self, blocks: int, slip_b: int = 0, lose: str = "", look: bool = True) -> None:
+    def pass_by(
+        self, blocks: int, slip_b: int = 0, lose: str = "", damage: str = "", look: bool = True
+    ) -> None:
         """Lines ``1000 + next …`` of both arms; those of b may be ``slip_b`` lines behind."""
         for _ in range(blocks):
             for arm in ARMS:
                 if arm != lose:
-                    self.put(arm, self.next - (slip_b if arm == "b" else 0))
+                    self.put(arm, self.next - (slip_b if arm == "b" else 0), damaged=arm == damage)
             self.next += ROWS
             if look:
                 self.turn()
 
-    def put(self, arm: str, at: int) -> None:
+    def put(self, arm: str, at: int, damaged: bool = False) -> None:
         ring = self.rings[arm]
         slot = ring.claim()
         assert slot is not None
-        slot.pixels[:] = self.lines[arm][at : at + ROWS]
-        slot.flags[:] = 0
+        slot.pixels[:] = 4095 if damaged else self.lines[arm][at : at + ROWS]
+        slot.flags[:] = LineFlag.INCOMPLETE if damaged else 0
         ring.commit(1000 + self.next, ROWS)
         ring.acquire()
         ring.release()
@@ -132,14 +134,40 @@ def test_lost_lines_and_lapped_slots_only_delay_a_verdict(beds: list[Bed]) -> No
     bed = Bed()
     beds.append(bed)
     bed.turn()
-    bed.pass_by(8)
+    bed.pass_by(4)
     bed.pass_by(1, lose="b")
-    bed.pass_by(3)
+    bed.pass_by(2)
     bed.pass_by(33, look=False)  # more than a ring holds
     assert bed.verdicts() == [Verdict.UNKNOWN, Verdict.UNKNOWN]
     bed.turn()
     assert bed.counters["lapped_a"] > 0
     assert bed.post.said == []
+    bed.pass_by(18)
+    assert bed.verdicts() == [Verdict.VERIFIED, Verdict.VERIFIED]
+
+
+@pytest.mark.parametrize("arm", ARMS)
+def test_frames_that_arrive_damaged_or_not_at_all_prove_nothing_against_the_code(
+    beds: list[Bed], arm: str
+) -> None:
+    bed = Bed(ThresholdPlan(arm, 4000.0, 100.0, rising=True, average_lines=64))
+    beds.append(bed)
+    bed.turn()
+    for damage, lose in ((arm, ""), ("", arm), (arm, "")):
+        bed.pass_by(4)
+        bed.pass_by(1, damage=damage, lose=lose)
+    bed.pass_by(2)
+    assert bed.verdicts() == [Verdict.VERIFIED, Verdict.VERIFIED]
+    assert not [note for note in bed.post.said if "verified" not in str(note)]
+
+
+def test_a_check_with_hardly_any_line_begins_again(beds: list[Bed]) -> None:
+    bed = Bed()
+    beds.append(bed)
+    bed.turn()
+    bed.pass_by(7)
+    bed.pass_by(10, damage="b")
+    assert (bed.counters["checks_b"], bed.post.said) == (0, [])
     bed.pass_by(18)
     assert bed.verdicts() == [Verdict.VERIFIED, Verdict.VERIFIED]
 

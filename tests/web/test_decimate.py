@@ -8,6 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
+from acquire.flags import LineFlag
 from acquire.web.decimate import (
     BINS,
     LOST,
@@ -28,9 +29,18 @@ def lines(first: int, count: int, width: int = 8) -> NDArray[np.uint16]:
     return rng.integers(0, WHITE + 1, (count, width), dtype=np.uint16)
 
 
-def put(decimator: Decimator, first: int, pixels: NDArray[np.uint16], *, lost: bool = False) -> None:
+def put(
+    decimator: Decimator,
+    first: int,
+    pixels: NDArray[np.uint16],
+    *,
+    lost: bool = False,
+    damaged: slice = slice(0),
+) -> None:
     chosen = decimator.sampled_lines(first, len(pixels))
-    decimator.add(first, len(pixels), chosen, pixels[chosen - first], lost=lost)
+    flags = np.zeros(len(pixels), np.uint16)
+    flags[damaged] = LineFlag.INCOMPLETE
+    decimator.add(first, flags, chosen, pixels[chosen - first], lost=lost)
 
 
 def rows_of(decimator: Decimator) -> Rows:
@@ -71,6 +81,19 @@ def test_a_gap_is_shown_as_rows_of_its_kind(lost: bool, kind: int) -> None:
     rows = rows_of(decimator)
     assert rows.kind.tolist() == [SEEN, SEEN, kind, kind, kind, SEEN, SEEN]
     assert not rows.high[2:5].any()
+
+
+def test_lines_without_an_image_are_shown_as_lost() -> None:
+    decimator = Decimator(Scale(4, 1, WHITE), 8)
+    put(decimator, 0, np.full((16, 8), 100, np.uint16))
+    damaged = np.full((12, 8), 100, np.uint16)
+    damaged[6:] = WHITE  # of an earlier line
+    put(decimator, 16, damaged, damaged=slice(6, None))
+    put(decimator, 28, np.full((8, 8), 100, np.uint16))
+    rows = rows_of(decimator)
+    assert rows.kind.tolist() == [*[SEEN] * 5, LOST, LOST, SEEN]
+    assert rows.high.max() == 100 * 255 // WHITE
+    assert rows.histogram[BINS - 1] == 0
 
 
 def test_a_long_pause_is_bounded() -> None:

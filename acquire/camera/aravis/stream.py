@@ -220,6 +220,8 @@ def _largest_socket() -> float:
         return math.inf
 
 
+RECEIVE_BYTES = 32 * 2**20
+"""Size of a socket's buffer: part of the packets of a tenth of a second at 10 Gbit/s."""
 _RMEM_MAX = Path("/proc/sys/net/core/rmem_max")
 _NUMBERS: dict[bytes, tuple[str, Any]] = {
     b"gint": ("v_int", c_int),
@@ -229,13 +231,16 @@ _NUMBERS: dict[bytes, tuple[str, Any]] = {
 
 
 def usual_parameters(frame_period_s: float) -> dict[str, Value]:
-    """Return timeouts for the frame period.
+    """Return timeouts for the frame period, and a large socket buffer.
 
     At a slow line rate a frame takes longer than Aravis waits for its packets by default: it would be given
-    up half-way, or requested before it is sent.
+    up half-way, or requested before it is sent. Its socket buffer is by default as large as the kernel's
+    usual one, or as a frame. Frames of few lines are small, and a busy host may leave several of them there.
     """
     period_us = round(frame_period_s * 1e6)
     return {
+        "socket-buffer": "fixed",
+        "socket-buffer-size": int(min(RECEIVE_BYTES, _largest_socket())),
         "packet-timeout": min(max(_PACKET_TIMEOUT_US, period_us), _MOST_US),
         "frame-retention": min(max(_FRAME_RETENTION_US, 4 * period_us), _MOST_US),
     }
