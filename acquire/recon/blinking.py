@@ -20,7 +20,7 @@ from acquire.recon.band import band_operator
 from acquire.recon.bandwidth import FEWEST_COEFFICIENTS, MARGIN, estimate_coefficients, light_beyond
 from acquire.recon.basis import TemporalBasis, resized
 from acquire.recon.estimates import InBand, Refined
-from acquire.recon.patterns import LEAST_NEED, ROUND, Refinement, find_patterns
+from acquire.recon.patterns import LEAST_NEED, PARAMETERS, ROUND, Refinement, find_patterns
 
 if TYPE_CHECKING:
     from acquire.arrays import Array
@@ -65,6 +65,10 @@ TRIAL_ROUNDS = 2
 """Number of rounds after which superfluous patterns are recognised."""
 LONGEST_TRIAL = 2
 """Largest number of times that as many rounds are made without them."""
+WEIGHT_PER_NOISE = float(__import__("os").environ.get("WPN", "0.17"))
+"""λ of the first round relative to the lines' noise."""
+NOISE_SHARE = 0.7
+"""Share of noise in the first look's prediction error, for cameras whose noise is unknown."""
 LOOSENED_IN_VAIN = 3
 """Number of rounds without improvement after which λ is no longer lowered: noise is being fitted."""
 TIGHTER = 2.0
@@ -199,7 +203,8 @@ def _in_patterns(
     basis = TemporalBasis(first.basis.frames, first.basis.count, problem.arrays)
     merges = (options.spatial_merge, options.temporal_merge)
     clock.reset()  # the limit holds for each stage: the first look takes longer where patterns are in doubt
-    refinement = _with_needed_patterns(Refinement(segment, problem, basis, found, merges), problem, clock)
+    refinement = Refinement(segment, problem, basis, found, merges, _for_noise(segment, problem, first))
+    refinement = _with_needed_patterns(refinement, problem, clock)
     best, kept, idle = np.inf, refinement.found, 0
     best_weight, held_best, recent = refinement.parameters.tv_weight, np.inf, np.inf
     for _ in clock.run(clock.iterations - clock.done, "refine", video=refinement.video):
@@ -230,6 +235,17 @@ def _in_patterns(
     if problem.prediction_error(first.predict()) < best < np.inf:
         return None
     return Refined(refinement, basis.count)
+
+
+def _for_noise(segment: Segment, problem: Problem, first: InBand) -> AdmmParameters:
+    """Parameters of the patterns, with a λ that is at first proportional to the noise, if there is some.
+
+    Without held-out samples and known noise the NaN leaves the weight as it is.
+    """
+    noise = problem.noise(segment)
+    if not noise < np.inf:
+        noise = NOISE_SHARE * problem.prediction_error(first.predict())
+    return replace(PARAMETERS, tv_weight=max(PARAMETERS.tv_weight, WEIGHT_PER_NOISE * noise))
 
 
 def _with_needed_patterns(refinement: Refinement, problem: Problem, clock: IterationClock) -> Refinement:

@@ -41,6 +41,12 @@ LARGEST_RANK = 12
 TAIL = 16
 """Index of the singular value that is taken as the error floor of the first reconstruction."""
 ABOVE_TAIL = 3.0
+"""Smallest ratio of a pattern's singular value to the floor."""
+LEAST_FOR_NOISE = 64
+"""Least number of cosines whose median singular value is that of noise."""
+NOISE_SPREAD, ABOVE_NOISE, GAP_IN_NOISE = 1.5, 2.0, 2.5
+"""Ratio to it below which the floor is noise as well; `ABOVE_TAIL` then; smallest ratio of neighbours at
+which patterns end. Noise reaches 1.8 floors. To miss a lamp costs 2 to 3 dB, a superfluous pattern 1 dB."""
 GAP = 3.0
 """Smallest ratio of neighbouring singular values at which patterns end. An extra pattern is harmful: it
 absorbs light that belongs to the others wherever the lines do not separate them, and the picture drifts
@@ -101,11 +107,26 @@ def find_patterns(theta: NDArray[Any], *, beyond_doubt: bool = False) -> Pattern
     if not _is_enough(rank, energy, LARGEST_REST_AT_GAP):
         if beyond_doubt:
             return None
-        rank = int(np.count_nonzero(energy[:TAIL] > ABOVE_TAIL**2 * energy[TAIL - 1]))
-        if not _is_enough(rank, energy, LARGEST_REST):
+        # Noise has most of the singular values to itself, and a share of each; of few it cannot be told.
+        noise = np.median(energy) if count >= LEAST_FOR_NOISE else 0.0
+        rank = _above_floor(energy[:TAIL], noise)
+        if not _is_enough(rank, energy - noise, LARGEST_REST):
             return None
     curves = vectors[:, :rank].astype(theta.dtype)
     return Patterns(curves, (curves.T @ theta.reshape(count, -1)).reshape(rank, side, side))
+
+
+def _above_floor(energy: NDArray[np.float64], noise: float) -> int:
+    """Number of patterns that rise above the last of these squared singular values, the floor.
+
+    If the floor is noise, and not what the first look has left, fainter ones count, unless they follow a gap.
+    """
+    floor = energy[-1]
+    clear = int(np.count_nonzero(energy > ABOVE_TAIL**2 * floor))
+    if floor >= NOISE_SPREAD**2 * noise:
+        return clear
+    rank = int(np.count_nonzero(energy > ABOVE_NOISE**2 * floor))
+    return clear if energy[clear - 1] > GAP_IN_NOISE**2 * energy[clear] else rank
 
 
 def _is_enough(rank: int, energy: NDArray[np.float64], rest: float) -> bool:

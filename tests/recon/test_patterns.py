@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -15,12 +16,14 @@ from acquire.errors import UsageError
 from acquire.forward import DualArm
 from acquire.geometry import Geometry
 from acquire.lines import Segment
+from acquire.noise import Noise
 from acquire.recon import HaarShrink, Progress, reconstruct
 from acquire.recon.bandwidth import FEWEST_COEFFICIENTS, estimate_coefficients
 from acquire.recon.basis import TemporalBasis
+from acquire.recon.blinking import _for_noise
 from acquire.recon.curves import CurveFit, CurveOperator
 from acquire.recon.lamps import _whitened, last_lamp
-from acquire.recon.patterns import Patterns, Refinement, find_patterns
+from acquire.recon.patterns import PARAMETERS, Patterns, Refinement, find_patterns
 from acquire.recon.problem import build_problem
 
 GEOMETRY = Geometry(12, 3, 72)
@@ -165,6 +168,46 @@ def test_patterns_end_at_a_gap_that_leaves_little_out(singular: tuple[float, ...
     found = find_patterns(spectrum(*singular))
     assert found is not None
     assert len(found.patterns) == rank
+
+
+@pytest.mark.parametrize(
+    ("singular", "rank"),
+    [
+        ((40, 6.6, 4.5, 2.8), 4),  # the fourth is hardly above the noise, which has twenty in all
+        ((80, 17, 10, 7, 2.4), 4),  # the fifth follows a gap
+        ((40,), 1),
+        ((), None),
+    ],
+)
+def test_lamps_are_found_in_noise(singular: tuple[float, ...], rank: int | None) -> None:
+    """Their singular values are given relative to the sixteenth of the noise."""
+    rng = np.random.default_rng(8)
+    noise = rng.standard_normal((128, 1024))
+    left, right = (np.linalg.qr(rng.standard_normal((size, 12)))[0] for size in noise.shape)
+    values = np.zeros(12)
+    values[: len(singular)] = singular
+    floor = np.linalg.svd(noise - left @ (left.T @ noise), compute_uv=False)[15 - len(singular)]
+    found = find_patterns(((left * values) @ right.T * floor + noise).reshape(128, 32, 32).astype(np.float32))
+    assert (None if found is None else len(found.patterns)) == rank
+
+
+def test_the_patterns_total_variation_begins_with_the_noise() -> None:
+    clean = segment()
+    lines = clean.lines / clean.lines.max() * 4000
+
+    def weight(full_well: float, *, known: bool = True) -> float:
+        gain = 4000 / full_well
+        shot = np.random.default_rng(7).poisson(lines / gain) * gain
+        noise = Noise((gain, gain), (1.0, 1.0)) if known else None
+        recorded = replace(clean, lines=shot.astype(np.float32), noise=noise)
+        problem = build_problem(recorded, 3, 1, hold_out=0.3)
+        exact = SimpleNamespace(predict=lambda: lines / (problem.scale * problem.norm))
+        return _for_noise(recorded, problem, exact).tv_weight
+
+    assert weight(1e7) == weight(1e6) == PARAMETERS.tv_weight
+    assert weight(1e3) > PARAMETERS.tv_weight
+    assert weight(2.5e2) == pytest.approx(2 * weight(1e3), rel=0.1)
+    assert weight(1e3, known=False) == pytest.approx(0.7 * weight(1e3), rel=0.1)
 
 
 def test_more_iterations_do_not_spoil_the_picture() -> None:
