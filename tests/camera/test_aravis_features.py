@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import ctypes
+import os
+import socket
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -162,6 +164,21 @@ def test_a_frame_is_waited_for_as_long_as_its_lines_take(
     assert found["packet-resend"] == "always"
     largest = int(Path("/proc/sys/net/core/rmem_max").read_text())
     assert (found["socket-buffer"], found["socket-buffer-size"]) == ("fixed", min(largest, RECEIVE_BYTES))
+
+
+def test_its_socket_has_a_large_buffer_before_the_first_packet(address: str) -> None:
+    camera = gige_camera(address)
+    try:
+        camera.arm()
+        sizes = []
+        for descriptor in filter(Path.is_socket, Path("/proc/self/fd").iterdir()):
+            with socket.socket(fileno=os.dup(int(descriptor.name))) as opened:
+                if opened.family == socket.AF_INET and opened.type == socket.SOCK_DGRAM:
+                    sizes.append(opened.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF))
+    finally:
+        camera.close()
+    largest = int(Path("/proc/sys/net/core/rmem_max").read_text())
+    assert max(sizes) == 2 * min(largest, RECEIVE_BYTES)  # the kernel counts its own data, too
 
 
 @pytest.mark.parametrize(

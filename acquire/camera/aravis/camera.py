@@ -14,7 +14,7 @@ import numpy as np
 
 from acquire.camera.aravis.bindings import errors, load
 from acquire.camera.aravis.features import AravisFeatures
-from acquire.camera.aravis.stream import StreamParameters, usual_parameters
+from acquire.camera.aravis.stream import StreamParameters, enlarge_sockets, usual_parameters
 from acquire.camera.assembly import (
     STATISTICS,
     Assembly,
@@ -134,6 +134,7 @@ class AravisCamera:
             self._give(stream, library.arv_buffer_new_allocate(self._payload))
         # Set before the start, so that a start that fails half-way is stopped as well.
         self._armed = True
+        enlarge_sockets()
         with errors(what) as error:
             library.arv_camera_start_acquisition(self._camera, error)
         self._heard_s = time.monotonic()

@@ -7,8 +7,11 @@ only with a stream: `StreamParameters` keeps the written values, and applies the
 
 from __future__ import annotations
 
+import contextlib
 import ctypes
 import math
+import os
+import socket
 from ctypes import byref, c_double, c_int, c_uint, c_void_p
 from dataclasses import dataclass
 from pathlib import Path
@@ -212,6 +215,10 @@ def _describe(library: Any, at: int, spec: _ParamSpec, kind: Kind) -> _Property:
     )
 
 
+def _receive_bytes() -> int:
+    return int(min(RECEIVE_BYTES, _largest_socket()))
+
+
 def _largest_socket() -> float:
     """Return the largest socket buffer of the kernel, which silently reduces larger ones."""
     try:
@@ -230,6 +237,21 @@ _NUMBERS: dict[bytes, tuple[str, Any]] = {
 }
 
 
+def enlarge_sockets() -> None:
+    """Give this process's UDP sockets, which are Aravis', a large buffer at once.
+
+    Aravis does so with the first packet. Until then a buffer holds a few frames, or 2 ms at 1 Gbit/s, and a
+    busy host that gets round to the first packet later than that loses lines at the beginning of a run.
+    """
+    for descriptor in Path("/proc/self/fd").iterdir():
+        if not descriptor.is_socket():
+            continue
+        # another thread may have closed it by now
+        with contextlib.suppress(OSError), socket.socket(fileno=os.dup(int(descriptor.name))) as opened:
+            if opened.family == socket.AF_INET and opened.type == socket.SOCK_DGRAM:
+                opened.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _receive_bytes())
+
+
 def usual_parameters(frame_period_s: float) -> dict[str, Value]:
     """Return timeouts for the frame period, and a large socket buffer.
 
@@ -240,7 +262,7 @@ def usual_parameters(frame_period_s: float) -> dict[str, Value]:
     period_us = round(frame_period_s * 1e6)
     return {
         "socket-buffer": "fixed",
-        "socket-buffer-size": int(min(RECEIVE_BYTES, _largest_socket())),
+        "socket-buffer-size": _receive_bytes(),
         "packet-timeout": min(max(_PACKET_TIMEOUT_US, period_us), _MOST_US),
         "frame-retention": min(max(_FRAME_RETENTION_US, 4 * period_us), _MOST_US),
     }
