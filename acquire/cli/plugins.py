@@ -38,12 +38,16 @@ def plugins(json: JsonFlag = False) -> None:
 
 
 def _rows() -> list[dict[str, Any]]:
-    from acquire.plugins import GROUPS, described
+    from acquire.plugins import GROUPS, OURS, described
 
     rows = []
     for group in GROUPS:
         for plugin in group.found():
-            error = group.trouble(plugin)
+            error = shown = group.trouble(plugin)
+            # One of our own plug-ins that lacks a package can name the extra that installs it.
+            if plugin.distribution == OURS and (missing := _MISSING.search(error)):
+                lacking = not_installed(ModuleNotFoundError(name=missing[1]))
+                shown = f"{missing[1]} is not installed; try: {lacking.hint}"
             rows.append(
                 {
                     "kind": group.what,
@@ -52,19 +56,8 @@ def _rows() -> list[dict[str, Any]]:
                     "distribution": plugin.distribution,
                     "version": plugin.version,
                     "works": not error,
-                    "error": _with_extra(error, plugin.distribution),
+                    "error": shown,
                     "about": "" if error else described(group.load(plugin.name)),
                 }
             )
     return rows
-
-
-def _with_extra(error: str, distribution: str) -> str:
-    """Name the extra to install if one of our own plug-ins lacks a package."""
-    from acquire.plugins import OURS
-
-    missing = _MISSING.search(error) if distribution == OURS else None
-    if missing is None:
-        return error
-    lacking = not_installed(ModuleNotFoundError(name=missing[1]))
-    return f"{missing[1]} is not installed; try: {lacking.hint}"

@@ -233,7 +233,12 @@ def reconstruct(
     if out is None:
         return
 
-    places = [_with_suffix(out, suffix) for suffix in prepared.requests]
+    # One of several videos has its voxel size in its name: NAME.zarr becomes NAME-1x820.zarr.
+    stem = out.rstrip("/")
+    places = [
+        re.sub(r"(\.[^./]*)?$", rf"-{suffix}\1", stem, count=1) if suffix else out
+        for suffix in prepared.requests
+    ]
     for place in places:
         check_new_place(place)
     if workers is None and (preview or (budget is not None and budget < PROCESSES_FROM * _age_s())):
@@ -257,11 +262,6 @@ def _check_options(search: str | None, *, anything_wanted: bool) -> None:
         )
     if search not in SEARCHES:
         raise UsageError(f"there is no --search {search}", possible="each, shared")
-
-
-def _with_suffix(out: str, suffix: str) -> str:
-    """Return the name of one of several videos: NAME.zarr becomes NAME-1x820.zarr."""
-    return re.sub(r"(\.[^./]*)?$", rf"-{suffix}\1", out.rstrip("/"), count=1) if suffix else out
 
 
 def _with_share(options: Options, elapsed_s: float, videos: int) -> Options:
