@@ -30,20 +30,15 @@ async def begin(
     if config.begin == "idle":
         return
     log.info("service.begin: %s", config.begin)
-    while service.status().state is State.IDLE and not await _is_done(config, service, run):
+    while service.status().state is State.IDLE:
+        try:
+            await run(lambda: service.arm(ArmRequest()))
+            if config.begin == "recording":
+                await run(lambda: service.start(StartRequest()))
+        except AcquireError as error:
+            text = f"service.begin: {error}; tried again in {config.retry_s:g} s"
+            log.warning("%s", text)
+            service.news.add("waiting", text, level="warning")
+        else:
+            return
         await asyncio.sleep(config.retry_s)
-
-
-async def _is_done(
-    config: ServiceConfig, service: Service, run: Callable[[Callable[[], None]], Awaitable[None]]
-) -> bool:
-    try:
-        await run(lambda: service.arm(ArmRequest()))
-        if config.begin == "recording":
-            await run(lambda: service.start(StartRequest()))
-    except AcquireError as error:
-        text = f"service.begin: {error}; tried again in {config.retry_s:g} s"
-        log.warning("%s", text)
-        service.news.add("waiting", text, level="warning")
-        return False
-    return True

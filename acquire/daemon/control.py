@@ -92,7 +92,11 @@ def _add_errors(app: FastAPI) -> None:
     @app.exception_handler(RequestValidationError)
     async def malformed(_: Request, error: RequestValidationError) -> JSONResponse:
         found = error.errors()
-        explained = [_explain(item) for item in found[:MOST_EXPLAINED]]
+        explained = []
+        for item in found[:MOST_EXPLAINED]:
+            # Everything here comes from the client, so it is shortened.
+            key = ".".join(str(part) for part in item["loc"] if part != "body") or "request"
+            explained.append(f"{shortened(key)} = {shown(item.get('input'))}: {shortened(item['msg'], 400)}")
         more = [f"and {len(found) - MOST_EXPLAINED} more"] if len(found) > MOST_EXPLAINED else []
         return _answer(UsageError("; ".join(explained + more), possible="/openapi.json"))
 
@@ -109,12 +113,6 @@ def _add_errors(app: FastAPI) -> None:
         # The server logs the traceback; the user gets one line that refers to it.
         text = f"defect in the daemon: {shortened(repr(error), 400)}"
         return _answer(AcquireError(text, hint="see the daemon's log"))
-
-
-def _explain(item: dict[str, Any]) -> str:
-    """Return what is wrong with a value, which is shortened since it comes from the client."""
-    key = ".".join(str(part) for part in item["loc"] if part != "body") or "request"
-    return f"{shortened(key)} = {shown(item.get('input'))}: {shortened(item['msg'], 400)}"
 
 
 def _answer(error: AcquireError) -> JSONResponse:

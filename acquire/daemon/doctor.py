@@ -57,7 +57,8 @@ def examine(rig: RigConfig | None, running: str | None) -> Iterator[Finding]:
 
     ``running`` is the version of the daemon that runs here, if any.
     """
-    yield _python()
+    text = f"acquire {__version__} on Python {sys.version.split()[0]}, numpy {np.__version__}"
+    yield Finding("versions", "good", text)
     yield _foreign_package()
     yield _plugins()
     yield _descriptors()
@@ -72,11 +73,6 @@ def examine(rig: RigConfig | None, running: str | None) -> Iterator[Finding]:
     yield from _producers(rig)
     yield from _port(rig)
     yield _daemon(running)
-
-
-def _python() -> Finding:
-    text = f"acquire {__version__} on Python {sys.version.split()[0]}, numpy {np.__version__}"
-    return Finding("versions", "good", text)
 
 
 def _foreign_package() -> Finding:

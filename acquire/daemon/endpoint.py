@@ -37,7 +37,18 @@ class Endpoint:
         Raises UsageError if ``path`` cannot be a socket, StateError if another daemon has it.
         """
         self.path = path
-        _check(path)
+        if len(os.fsencode(path)) > LONGEST_PATH:
+            raise UsageError(
+                f"control socket {path} has too long a path",
+                possible=f"a path of at most {LONGEST_PATH} bytes",
+                hint=ELSEWHERE,
+            )
+        if path == default_socket():
+            _own(path.parent)
+        if not path.parent.is_dir():
+            raise UsageError(f"control socket {path}: its directory does not exist", hint=ELSEWHERE)
+        if os.path.lexists(path) and not stat.S_ISSOCK(path.lstat().st_mode):
+            raise UsageError(f"control socket {path}: something else is there, and stays untouched")
         self._lock = _lock(path)
         try:
             self.socket = _listen(path)
@@ -62,21 +73,6 @@ class Endpoint:
 
 def lock_path(path: Path) -> Path:
     return path.with_name(path.name + ".lock")
-
-
-def _check(path: Path) -> None:
-    if len(os.fsencode(path)) > LONGEST_PATH:
-        raise UsageError(
-            f"control socket {path} has too long a path",
-            possible=f"a path of at most {LONGEST_PATH} bytes",
-            hint=ELSEWHERE,
-        )
-    if path == default_socket():
-        _own(path.parent)
-    if not path.parent.is_dir():
-        raise UsageError(f"control socket {path}: its directory does not exist", hint=ELSEWHERE)
-    if os.path.lexists(path) and not stat.S_ISSOCK(path.lstat().st_mode):
-        raise UsageError(f"control socket {path}: something else is there, and stays untouched")
 
 
 def _own(directory: Path) -> None:

@@ -30,8 +30,14 @@ def status_document(place: Path | None) -> dict[str, Any]:
 
     Raises NoDaemonError if none listens and none is starting, otherwise one of `NO_ANSWER`.
     """
+    place = place or default_socket()
     connection = _Connection("acquire", timeout=CONNECT_TIMEOUT_S)
-    connection.sock = _connected(place or default_socket())
+    try:
+        connection.sock = connect(place, CONNECT_TIMEOUT_S)
+    except NoDaemonError:
+        if is_one_starting(place):
+            raise ConnectionRefusedError("a daemon is starting") from None
+        connection.sock = connect(place, CONNECT_TIMEOUT_S)  # a daemon may have begun to listen in between
     try:
         connection.request("GET", "/status", headers={"Connection": "close"})
         answer = connection.getresponse()
@@ -43,15 +49,6 @@ def status_document(place: Path | None) -> dict[str, Any]:
     if not isinstance(document, dict):
         raise TypeError("the status is not an object")
     return document
-
-
-def _connected(place: Path) -> socket.socket:
-    try:
-        return connect(place, CONNECT_TIMEOUT_S)
-    except NoDaemonError:
-        if is_one_starting(place):
-            raise ConnectionRefusedError("a daemon is starting") from None
-        return connect(place, CONNECT_TIMEOUT_S)  # a daemon may have begun to listen in between
 
 
 class _Connection(http.client.HTTPConnection):

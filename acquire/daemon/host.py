@@ -105,19 +105,14 @@ def needed_bytes(config: RigConfig) -> tuple[int, int]:
     """Return the memory needed for the rings, and for a simulated scene."""
     line_bytes = config.pixels * np.dtype(config.cameras.a.dtype).itemsize
     rings = len(ARMS) * config.ring_slots * config.stream.block_lines * line_bytes
-    return rings, SIMULATING * _scene_bytes(config)
-
-
-def _scene_bytes(config: RigConfig) -> int:
-    """Return the memory of a scene in one process; 0 if no camera is simulated from one."""
-    if not config.needs_scene:
-        return 0
+    if not config.needs_scene:  # no camera is simulated from one
+        return rings, 0
     scene = load_scene(config.scene_file())
     fibre = config.laid_out
     size = config.geometry.stages * config.geometry.substeps if fibre is None else fibre.side
     if scene.optics.layout == "interline":
         size *= scene.optics.baseline_factor
-    return size * size * max(SCENE_BYTES, SCENE_BYTES // 4 * scene.sources)
+    return rings, SIMULATING * size * size * max(SCENE_BYTES, SCENE_BYTES // 4 * scene.sources)
 
 
 def memory_bytes() -> int:

@@ -34,7 +34,11 @@ class Journal:
             return []
         try:
             named = read_object(self._file, follow=False)[self._key]
-            paths = [str(path) for path in named[:MOST_PATHS] if _is_path(path)]
+            paths = [
+                path
+                for path in named[:MOST_PATHS]
+                if isinstance(path, str) and "\0" not in path and Path(path).is_absolute()
+            ]
         except FileNotFoundError:
             return []
         except (OSError, ValueError, LookupError, TypeError) as error:
@@ -65,7 +69,3 @@ class Journal:
                 error.strerror or error,
                 self._what,
             )
-
-
-def _is_path(value: object) -> bool:
-    return isinstance(value, str) and "\0" not in value and Path(value).is_absolute()

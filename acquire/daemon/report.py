@@ -80,7 +80,9 @@ def arm_statuses(seen: CaptureStatus, rates: Rates) -> dict[str, ArmStatus]:
             delivered=counts["delivered"],
             preroll=counts["preroll"],
             discarded=counts["discarded"],
-            lost=_lost(seen, arm),
+            # The ledger's losses include lines that never came, so its counts take precedence.
+            lost={str(cause): lines for cause, lines in counts["lost"].items()}
+            | (seen.accounts[arm].lost if arm in seen.accounts else {}),
             recorded=counts["recorded"],
             missing=counts["missing"],
             rate_hz=rates.of(arm),
@@ -93,9 +95,3 @@ def arm_statuses(seen: CaptureStatus, rates: Rates) -> dict[str, ArmStatus]:
         )
         for arm, counts in seen.lines.items()
     }
-
-
-def _lost(seen: CaptureStatus, arm: str) -> dict[str, int]:
-    """Return the arm's losses; those of the ledger, if any, include lines that never came."""
-    counted = {str(cause): lines for cause, lines in seen.lines[arm]["lost"].items()}
-    return counted | (seen.accounts[arm].lost if arm in seen.accounts else {})

@@ -171,19 +171,17 @@ class Salvage:
         ]
         ended: list[RecoveryStatus] = []
         for task in sorted(able, key=lambda task: not task.ours):
-            hindered = hindrance(task) or self._spawn(task)
+            hindered = hindrance(task)
             if hindered is None:
-                break
+                try:
+                    self._worker = Worker("salvage", salvage, task)
+                except DeviceError as error:
+                    hindered = RecoveryStatus(path=task.path, state="failed", text=str(error))
+                else:
+                    self._under_way = task
+                    break
             ended += self._settle(task, hindered)
         return ended
-
-    def _spawn(self, task: Task) -> RecoveryStatus | None:
-        try:
-            self._worker = Worker("salvage", salvage, task)
-        except DeviceError as error:
-            return RecoveryStatus(path=task.path, state="failed", text=str(error))
-        self._under_way = task
-        return None
 
     def _take_result(self) -> list[RecoveryStatus]:
         worker, task = self._worker, self._under_way

@@ -144,7 +144,10 @@ class Daemon:
         serving = asyncio.create_task(self._server.answer())
         # READY=1 only once requests are answered: a daemon that reports it to systemd, and then cannot load
         # its modules, would never be restarted.
-        if await self._is_answering(serving):
+        answering = asyncio.create_task(self._server.answering.wait())
+        await asyncio.wait((serving, answering), return_when=asyncio.FIRST_COMPLETED)
+        answering.cancel()
+        if self._server.answering.is_set():  # otherwise `serving` has the error
             log.info("listening on %s (process %d)", self._endpoint.path, os.getpid())
             notify("READY=1")
         watchdog = asyncio.create_task(self._feed_watchdog())
@@ -157,13 +160,6 @@ class Daemon:
             watchdog.cancel()
             self._last_resort.cancel()
         return self._exit_code
-
-    async def _is_answering(self, serving: asyncio.Task[None]) -> bool:
-        """Wait until requests are answered; return False if that failed: `serving` then has the error."""
-        answering = asyncio.create_task(self._server.answering.wait())
-        await asyncio.wait((serving, answering), return_when=asyncio.FIRST_COMPLETED)
-        answering.cancel()
-        return self._server.answering.is_set()
 
     async def _supervise(self, serving: asyncio.Task[None]) -> None:
         while not (self._ending.is_set() or serving.done()):

@@ -239,7 +239,11 @@ class Service:
         try:
             if self._state is State.RECORDING:
                 self._stop("signal")
-            while self._state is State.DRAINING and not self._waits_too_long():
+            while self._state is State.DRAINING:
+                # A disk that makes no progress must not keep the daemon from ending: the next daemon recovers
+                # the recording.
+                if self._take is not None and self._seen.waiting and self._idles(self._take):
+                    break
                 self.supervise()
                 if self._state is State.DRAINING:
                     self._hurried.wait(POLL_S)
@@ -259,10 +263,6 @@ class Service:
     def _idles(self, take: Take) -> bool:
         """Return whether the recording has made no progress for longer than allowed."""
         return take.idle_s(self._seen) > self.config.recording.seal_timeout_s
-
-    def _waits_too_long(self) -> bool:
-        """Return whether the disk keeps the daemon from ending; the next daemon recovers the recording."""
-        return self._take is not None and bool(self._seen.waiting) and self._idles(self._take)
 
     def _stop(self, reason: str) -> None:
         assert self._run is not None

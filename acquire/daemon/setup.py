@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import platform
 from dataclasses import asdict
@@ -38,6 +39,11 @@ def version_of(config: RigConfig) -> Version:
 def setup_of(config: RigConfig, origin: str) -> Setup:
     """Return the whole setup, read from the file ``origin``; it holds no secrets (`config.recording`)."""
     rate_hz = config.line_rate_hz
+    versions = {"acquire": __version__, "python": platform.python_version()}
+    for name in LIBRARIES:
+        # Those of the cameras are not installed on every platform.
+        with contextlib.suppress(metadata.PackageNotFoundError):
+            versions[name] = metadata.version(name)
     return Setup(
         name=config.name,
         file=origin,
@@ -48,7 +54,7 @@ def setup_of(config: RigConfig, origin: str) -> Setup:
         white_dn=config.cameras.a.white_dn,
         black_dn={arm: config.cameras.arm(arm).black_level_dn for arm in ARMS},
         history_s=config.history_s,
-        versions={"acquire": __version__, "python": platform.python_version()} | _libraries(),
+        versions=versions,
     )
 
 
@@ -69,14 +75,4 @@ def _changed(model: BaseModel, prefix: str = "") -> list[tuple[str, Any]]:
             found += _changed(value, f"{prefix}{name}.")
         elif field.is_required() or value != field.get_default(call_default_factory=True):
             found.append((f"{prefix}{name}", dumped[name]))
-    return found
-
-
-def _libraries() -> dict[str, str]:
-    found = {}
-    for name in LIBRARIES:
-        try:
-            found[name] = metadata.version(name)
-        except metadata.PackageNotFoundError:
-            continue
     return found

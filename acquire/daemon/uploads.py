@@ -60,14 +60,6 @@ def check_upload(config: RigConfig) -> None:
         ) from error
 
 
-def _wants_copy(path: Path) -> bool:
-    """Return whether the rig that recorded it copies its recordings."""
-    try:
-        return upload_target(read_root(LocalSource(path))["attributes"]) is not None
-    except AcquireError:
-        return False
-
-
 class Uploads:
     """Recordings to be copied, and their progress. For one thread; only `prove` and `close` wait.
 
@@ -137,7 +129,13 @@ class Uploads:
 
     def recovered(self, path: Path) -> None:
         """Note that a recording is sealed after recovery: copy it if its configuration asks for that."""
-        if path in self._found or _wants_copy(path):
+        try:
+            wanted = (
+                path in self._found or upload_target(read_root(LocalSource(path))["attributes"]) is not None
+            )
+        except AcquireError:
+            return
+        if wanted:
             self.renew(path)
 
     def poll(self) -> None:
