@@ -129,7 +129,7 @@ class RingSource:
             arm: Gauge(setup.black_dn[arm], setup.white_dn) for arm in rings.arms if arm in self.names
         }
         self._peeks: dict[str, Peek] = {}
-        with ExitStack() as undo:
+        with ExitStack() as undo:  # closes the first if the second cannot be opened
             for arm in self._gauges:
                 self._peeks[arm] = Peek(arm, rings.arms[arm].path, shape_of(rings.arms[arm]))
                 undo.callback(self._peeks[arm].close)

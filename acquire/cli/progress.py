@@ -133,7 +133,7 @@ class Progress:
         if self._over.wait(max(0.0, FIRST_S - self.elapsed_s)):
             return
         while True:
-            with self._lock:
+            with self._lock:  # the other thread changes several of these at a time
                 left = self.left_s
                 if json_requested():
                     times = {

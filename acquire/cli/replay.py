@@ -184,9 +184,8 @@ def _record(stored: Recording, out: Path, speed: float) -> str | None:
         directory = held.enter_context(_private_directory())
         gate, socket, log = (directory / name for name in ("gate", "c.sock", "daemon.log"))
         table = replay_rig(stored, speed, directory, replay_gate=str(gate))
-        table["check"] = {
-            "enable": False
-        }  # flags are replayed; the time of a new verdict depends on the load
+        # Flags are replayed; the time of a new verdict depends on the load.
+        table["check"] = {"enable": False}
         table["recording"]["after"] = "idle"
         # A process of its own, because the daemon installs signal handlers and starts threads.
         options = [f"--config={_rig_file(directory, table)}", f"--socket={socket}"]
@@ -194,9 +193,8 @@ def _record(stored: Recording, out: Path, speed: float) -> str | None:
         client = held.enter_context(Client(socket))
         advance = held.enter_context(stage_progress(f"replaying {out.name}"))
         await_daemon(client, process, log)
-        client.arm(
-            force=True
-        )  # even if the disk is too slow: the ring holds the lines until they are written
+        # Even if the disk is too slow: the ring holds the lines until they are written.
+        client.arm(force=True)
         client.start(out.absolute(), lines=stored.lines)
         gate.touch()  # lets the cameras deliver lines, now that the recording has begun
         status = follow(client, stored.lines, advance)

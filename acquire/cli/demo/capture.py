@@ -100,6 +100,7 @@ def daemon(plan: DemoPlan, socket: Path) -> Iterator[subprocess.Popen[bytes]]:
 @contextmanager
 def daemon_process(options: list[str], log: Path) -> Iterator[subprocess.Popen[bytes]]:
     """Run ``acquire serve`` in a process of its own, which is ended with the block in any case."""
+    # Even if this process is killed, the daemon ends: its standard input is then closed (--owned).
     command = [sys.executable, "-m", "acquire", "serve", "--owned", *options]
     with (
         log.open("wb") as file,
