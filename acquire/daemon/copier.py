@@ -109,7 +109,7 @@ def copy_recordings(mailbox: Mailbox, target: str, copies: tuple[Copy, ...]) -> 
     be_patient()
     with contextlib.suppress(UsageError):  # each try reports it
         check_url(target)  # imports packages, which takes a moment
-    mailbox.post(Reached(0))
+    mailbox.post(Reached(0))  # answers no query, but shows the owner that this process can
     copier = Copier(mailbox, target)
     for copy in copies:
         copier.add(copy.path, ours=copy.ours)

@@ -68,27 +68,24 @@ def search(directory: Path, recorded: Collection[Path] = ()) -> Found:
     paths = sorted(path for path in directory.iterdir() if path.name.endswith(".zarr"))
     known, found = set(recorded), Found([], [])
     for path in dict.fromkeys([*paths, *recorded]):
-        _look_at(path, found, known=path in known)
+        noted = path in known  # by an earlier daemon, whatever its name
+        try:
+            attributes = read_root(LocalSource(path))["attributes"]
+        except AcquireError as error:
+            if path.is_dir() and (noted or (root_is_lost(path) and known_attributes(path) is not None)):
+                found.open.append(path)  # its root may be rebuilt
+            elif noted and not os.path.lexists(path):
+                text = (
+                    "it was being recorded when an earlier daemon ended, and is not there: "
+                    "is its disk mounted?"
+                )
+                found.odd.append(RecoveryStatus(path=path, state="gone", text=text))
+            else:
+                found.odd.append(RecoveryStatus(path=path, state="left", text=error.message))
+            continue
+        if attributes.get("format") in READABLE and attributes.get("state") == "recording":
+            found.open.append(path)
     return found
-
-
-def _look_at(path: Path, found: Found, *, known: bool) -> None:
-    """Add the path to ``found``. ``known``: it was recorded, and does not just have a recording's name."""
-    try:
-        attributes = read_root(LocalSource(path))["attributes"]
-    except AcquireError as error:
-        if path.is_dir() and (known or (root_is_lost(path) and known_attributes(path) is not None)):
-            found.open.append(path)  # its root may be rebuilt
-        elif known and not os.path.lexists(path):
-            text = (
-                "it was being recorded when an earlier daemon ended, and is not there: is its disk mounted?"
-            )
-            found.odd.append(RecoveryStatus(path=path, state="gone", text=text))
-        else:
-            found.odd.append(RecoveryStatus(path=path, state="left", text=error.message))
-        return
-    if attributes.get("format") in READABLE and attributes.get("state") == "recording":
-        found.open.append(path)
 
 
 def salvage(mailbox: Mailbox, task: Task) -> None:

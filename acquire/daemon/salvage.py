@@ -119,6 +119,7 @@ class Salvage:
         """Wait until the recordings of this daemon's runs are recovered, or the time is up; return these."""
         deadline = time.monotonic() + timeout_s
         ended: list[RecoveryStatus] = []
+        # One that was put off is not waited for: another process holds it.
         while any(task.ours and not task.tries for task in self._tasks.values()):
             ended += self.poll(capturing=True)
             if time.monotonic() > deadline:
@@ -210,6 +211,7 @@ class Salvage:
         if status.state == "waiting":
             status = status.model_copy(update={"state": "left"})
             self._list(status)
+        # One that is gone with acknowledged lines stays in the journal: its disk may only not be mounted.
         if status.state == "recovered" or (status.state == "gone" and not task.committed_lines):
             self.ended(status.path)
         level = logging.INFO if status.state == "recovered" else logging.WARNING

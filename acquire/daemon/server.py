@@ -223,7 +223,7 @@ class Daemon:
 
     async def _in_device_thread(self, work: Callable[[], T]) -> T:
         def timed() -> T:
-            self._begun_s = time.monotonic()
+            self._begun_s = time.monotonic()  # from here on the watchdog demands progress
             try:
                 return work()
             finally:

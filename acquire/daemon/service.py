@@ -458,6 +458,7 @@ class Service:
         self._publish()
 
     def _publish(self) -> None:
+        # Progress, by which the watchdog tells a slow command from one that hangs.
         self.moved_s = time.monotonic()
         self._status = Status(
             state=self._state,
@@ -467,7 +468,7 @@ class Service:
             name=self.config.name,
             version=__version__,
             pid=os.getpid(),
-            uptime_s=0.0,
+            uptime_s=0.0,  # `status` has the time of the query
             run_id=None if self._run is None else self._run.run_id,
             recording=None if self._take is None else self._take.status(self._seen),
             arms=arm_statuses(self._seen, self._rates),

@@ -227,22 +227,20 @@ class Uploads:
         while (message := worker.message()) is not None:
             self._awake = True
             if isinstance(message, UploadStatus):
-                self._take_status(message)
+                before = self._found.get(message.path)
+                known = None if before is None else (before.state, before.error)
+                if message.error and known != (message.state, message.error):
+                    log.warning("upload of %s %s: %s", message.path, message.state, message.error)
+                elif message.state == "copied":
+                    log.info("upload of %s: %d lines are in %s", message.path, message.lines, message.url)
+                if message.state in ("copying", "copied"):  # the store can be reached
+                    self.warning = None
+                self._list(message)
             elif isinstance(message, Reached):
                 self._answer = message
             elif isinstance(message, Failed):
                 return str(message.error)
         return None
-
-    def _take_status(self, new: UploadStatus) -> None:
-        before = self._found.get(new.path)
-        if new.error and (before is None or (new.state, new.error) != (before.state, before.error)):
-            log.warning("upload of %s %s: %s", new.path, new.state, new.error)
-        elif new.state == "copied":
-            log.info("upload of %s: %d lines are in %s", new.path, new.lines, new.url)
-        if new.state in ("copying", "copied"):
-            self.warning = None
-        self._list(new)
 
     def _wait_for_another(self, why: str) -> None:
         if time.monotonic() - self._born_s > MOST_WAIT_S:
