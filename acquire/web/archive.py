@@ -131,7 +131,12 @@ class Archive:
         path = self.path_of(name)
         video = open_video(path)
         if name not in self._ranges:
-            _remember(self._ranges, name, _display_range(video), MOST_PICTURES)
+            # Black and white are the 0.1 % and 99.9 % quantiles of frames over the whole length.
+            frames = video.video.shape[0]
+            step = max(1, frames // SAMPLED_FRAMES)
+            values = np.stack([np.asarray(video.video[k], np.float32) for k in range(0, frames, step)])
+            black, white = map(float, np.nanquantile(values, (0.001, 0.999)))
+            _remember(self._ranges, name, (black, white if white > black else black + 1.0), MOST_PICTURES)
         low, high = self._ranges[name]
         return _video_facts(name, video).model_copy(update={"low": low, "high": high})
 
@@ -254,12 +259,3 @@ def _video_facts(name: str, video: VideoFile) -> VideoFacts:
         start_ns=int(video.time_ns[0]) if len(video.time_ns) else None,
         trusted=None if video.trusted is None else (video.trusted.start, video.trusted.stop),
     )
-
-
-def _display_range(video: VideoFile) -> tuple[float, float]:
-    """Return the values shown black and white: the 0.1 % and 99.9 % quantiles of frames over its length."""
-    frames = video.video.shape[0]
-    step = max(1, frames // SAMPLED_FRAMES)
-    values = np.stack([np.asarray(video.video[k], np.float32) for k in range(0, frames, step)])
-    low, high = np.nanquantile(values, (0.001, 0.999))
-    return (float(low), float(high)) if high > low else (float(low), float(low) + 1.0)

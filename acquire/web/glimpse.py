@@ -81,7 +81,7 @@ class Glimpses:
         self._columns = (everything,) * 2 if fibre is None or self.tile is None else fibre.pixels(self.tile)
         self._code = config.code.build()
         self._peeks: dict[str, Peek] = {}
-        with contextlib.ExitStack() as undo:
+        with contextlib.ExitStack() as undo:  # closes the first if the second cannot be mapped
             for arm in ARMS:
                 place = rings.arms[arm]
                 self._peeks[arm] = undo.enter_context(

@@ -89,7 +89,7 @@ class Buckets:
         bucket = self._buckets.pop(key, None) or _Bucket(self._most, now_s)
         bucket.left = min(self._most, bucket.left + self._per_s * (now_s - bucket.filled_s))
         bucket.filled_s = now_s
-        self._buckets[key] = bucket
+        self._buckets[key] = bucket  # as the last one, so that the first has been idle for longest
         while len(self._buckets) > MOST_ADDRESSES:
             self._buckets.popitem(last=False)
         return bucket

@@ -117,18 +117,15 @@ class Hub:
                 self._news.append((self._count, json_message("news", item.model_dump_json())))
                 self._count += 1
             elif item is not None:
-                await self._take_status(item)
+                if not self.connected:
+                    log.info("connected to the daemon (process %d)", item.pid)
+                self.connected, self.status = True, item
+                self._version += 1
+                if item.run_id != self._run_id:  # each run has its own rings
+                    self._run_id = item.run_id
+                    self._armed_s = time.monotonic()
+                    self.live.show(None if item.run_id is None else await self.client.rings(), self.setup)
             self._wake()
-
-    async def _take_status(self, status: Status) -> None:
-        if not self.connected:
-            log.info("connected to the daemon (process %d)", status.pid)
-        self.connected, self.status = True, status
-        self._version += 1
-        if status.run_id != self._run_id:  # each run has its own rings
-            self._run_id = status.run_id
-            self._armed_s = time.monotonic()
-            self.live.show(None if status.run_id is None else await self.client.rings(), self.setup)
 
     async def _watch(self) -> None:
         """Detect a daemon that hangs: it sends nothing, but its connection stays open."""
@@ -140,7 +137,7 @@ class Hub:
     def _lose(self, error: Exception) -> None:
         if self.connected:
             log.warning("%s", error)
-        self.connected, self._run_id = False, None
+        self.connected, self._run_id = False, None  # so that even the same run's rings are shown again
         self.why = error.message if isinstance(error, AcquireError) else str(error)
         self._version += 1
         self.live.show(None, None)
