@@ -56,9 +56,10 @@ ARCHIVE = b"PK\x03\x04"
 class Layout:
     """The layout of a file, as far as the file itself does not define it.
 
-    Attributes ---------- dtype, pixels, skip_bytes : for raw binary: sample type (``uint8``, ``<u2``,
-    ``>u2``), pixels per line, and
-        bytes before the first line
+    Attributes
+    ----------
+    dtype, pixels, skip_bytes : for raw binary: sample type (``uint8``, ``<u2``, ``>u2``), pixels per line,
+        and bytes before the first line
     dataset : path of the array inside an HDF5 file; None for the only one that can be lines
     columns : pixels of each line that belong to the arm, first and after the last; None for all
     """
@@ -207,6 +208,7 @@ def _plain(
     def read(arm: int | None, start: int, stop: int) -> NDArray[Any]:
         begin = offset + ((arm or 0) * shape[-2] + start) * line_bytes
         found = np.fromfile(path, dtype, (stop - start) * shape[-1], offset=begin)
+        # Only whole lines of a file that was cut short: `LineFile.rows` then misses the others.
         return found[: len(found) // shape[-1] * shape[-1]].reshape(-1, shape[-1])
 
     return read
@@ -214,7 +216,7 @@ def _plain(
 
 def _numpy(path: Path, _: Layout, __: ExitStack) -> LineFile:
     array = mapped(path)
-    in_order = array.flags.c_contiguous
+    in_order = array.flags.c_contiguous  # in Fortran order a line's pixels are scattered over the file
     read = _plain(path, array.dtype, array.shape, array.offset) if in_order else _sliced(array)
     return LineFile(path, "NumPy", array.shape, array.dtype, read)
 
@@ -291,10 +293,11 @@ def _tiff(path: Path, _: Layout, held: ExitStack) -> LineFile:
     tifffile = library("tifffile", "export", "a TIFF file")
     file = held.enter_context(tifffile.TiffFile(path))
     series = file.series[0]
+    # tifffile states the type in native byte order, and the pixels are read as they are in the file.
     shape, dtype = tuple(map(int, series.shape)), np.dtype(file.byteorder + series.dtype.str[1:])
     arms = len(shape) == 3 and series.axes.startswith("C") and shape[0] == 2
     lines = shape if arms else (math.prod(shape[:-1]), shape[-1])
-    if series.dataoffset is not None:
+    if series.dataoffset is not None:  # all pixels lie in one piece, without compression
         return LineFile(path, "TIFF", lines, dtype, _plain(path, dtype, lines, series.dataoffset))
     return LineFile(path, "TIFF", lines, dtype, _pages(path, series, lines))
 

@@ -103,6 +103,7 @@ def _columns(recording: Recording, rows: range) -> Iterator[Array]:
 def _steps(recording: Recording, rows: range) -> Iterator[tuple[int, int]]:
     """Yield the parts of the rows that are read at once, as start and stop."""
     stream = recording.arms[ARMS[0]]
+    # A multiple of the step, so that no group of lines is split between two blocks.
     size = max(1, BLOCK_BYTES // (stream.pixels * stream.dtype.itemsize * rows.step)) * rows.step
     for start in range(rows.start, rows.stop, size):
         yield start, min(rows.stop, start + size)

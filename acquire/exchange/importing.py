@@ -132,6 +132,7 @@ def import_lines(
             stored = {arm: lines if arm in arms else 0 for arm in ARMS}
             ledger = {arm: {"stored": stored[arm], "missing": {NO_ARM: lines - stored[arm]}} for arm in ARMS}
             whole = len(arms) == len(ARMS)
+            # Tainted at best: no line's code and time come from a trigger.
             condition = RunCondition.TAINTED if whole else RunCondition.INCOMPLETE
             writer.seal(condition, "imported from files of another program", ledger)
         delivery.deliver()
@@ -309,7 +310,7 @@ def _write(
 
 def _block(source: Arm | None, arm: str, spec: RecordingSpec, start: int, stop: int) -> LineBlock:
     first = spec.first_line + start
-    if source is None:
+    if source is None:  # both arms of a recording have the same rows
         pixels: NDArray[Any] = np.zeros((stop - start, spec.pixels), spec.line_dtype)
         flags = np.full(stop - start, LineFlag.MISSING, np.uint16)
         return LineBlock(arm, first, pixels, flags)

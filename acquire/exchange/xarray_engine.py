@@ -21,7 +21,6 @@ from acquire.store.source import source_of
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
-    from acquire.store import Recording
 
 IMAGE = "video"
 """Name of a video's image in the dataset; in the file it is level 0."""
@@ -42,33 +41,27 @@ class AcquireBackend(BackendEntrypoint):
     ) -> xarray.Dataset:
         """Open a video, or an arm of a recording (``group``, default "a"). Raises as `open_recording`."""
         place = str(filename_or_obj)
+        dataset: xarray.Dataset
         if (format_of(place) or "").startswith("acquire-video/"):
-            dataset = _video(place, group)
+            if group is not None:
+                raise UsageError(f"{place} has no group {group!r}", possible="none: a video has no groups")
+            levels = open_video(place).attrs["ome"]["multiscales"][0]["datasets"]
+            smaller = [str(level["path"]) for level in levels[1:]]
+            store = source_of(place).zarr_store()
+            # With chunks=None xarray reads lazily without dask, which may not be installed.
+            dataset = xarray.open_zarr(store, consolidated=False, chunks=None, drop_variables=smaller)
+            dataset = dataset.rename({"0": IMAGE})
         else:
-            dataset = _arm(open_recording(place), ARMS[0] if group is None else group)
+            recording, arm = open_recording(place), ARMS[0] if group is None else group
+            if arm not in ARMS:
+                raise UsageError(f"{recording} has no group {arm!r}", possible=", ".join(ARMS))
+            store = recording.source.zarr_store()
+            dataset = xarray.open_zarr(store, group=arm, consolidated=True, chunks=None)
+            first = recording.first_line
+            dataset = dataset.assign_coords(line=pd.RangeIndex(first, first + dataset.sizes["line"]))
         names = [drop_variables] if isinstance(drop_variables, str) else [*(drop_variables or ())]
         return dataset.drop_vars(names)
 
     def guess_can_open(self, _: Any) -> bool:
         """Return False: the engine is used only by name and does not displace xarray's Zarr engine."""
         return False
-
-
-def _video(place: str, group: str | None) -> xarray.Dataset:
-    if group is not None:
-        raise UsageError(f"{place} has no group {group!r}", possible="none: a video has no groups")
-    levels = open_video(place).attrs["ome"]["multiscales"][0]["datasets"]
-    smaller = [str(level["path"]) for level in levels[1:]]
-    store = source_of(place).zarr_store()
-    # With chunks=None xarray reads lazily without dask, which may not be installed.
-    dataset: xarray.Dataset = xarray.open_zarr(store, consolidated=False, chunks=None, drop_variables=smaller)
-    return dataset.rename({"0": IMAGE})
-
-
-def _arm(recording: Recording, arm: str) -> xarray.Dataset:
-    if arm not in ARMS:
-        raise UsageError(f"{recording} has no group {arm!r}", possible=", ".join(ARMS))
-    store = recording.source.zarr_store()
-    dataset: xarray.Dataset = xarray.open_zarr(store, group=arm, consolidated=True, chunks=None)
-    first = recording.first_line
-    return dataset.assign_coords(line=pd.RangeIndex(first, first + dataset.sizes["line"]))
