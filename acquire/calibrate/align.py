@@ -62,6 +62,7 @@ def align(a: Still, b: Still, geometry: Geometry, start: tuple[float, float] = (
     freedom = max(1, len(solved.fun) - len(numbers))
     try:
         jacobian = np.asarray(solved.jac, np.float64)
+        # scipy's cost is half the sum of squares.
         covariance = np.linalg.inv(jacobian.T @ jacobian) * 2 * solved.cost / freedom
     except np.linalg.LinAlgError as error:
         raise _undetermined() from error

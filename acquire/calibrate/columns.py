@@ -69,6 +69,7 @@ def dark(exposure: Exposure, *, covered: bool = False, progress: Progress = no_p
     usable: NDArray[np.bool_] = size - middle <= np.maximum(NOISY * spread, np.log(3.0))
     quantities = {
         "offset_dn": Measured(found.mean, np.sqrt(np.maximum(found.variance, QUANTISATION_DN2) / lines)),
+        # The standard error of a standard deviation of n values is σ/√(2n).
         "noise_dn": Measured(noise, noise / np.sqrt(2 * lines)),
     }
     facts = {**exposure.facts(), "covered": covered}
@@ -194,6 +195,7 @@ def _blurred_edges(
 def _spread(shape: NDArray[np.float64], usable: NDArray[np.bool_]) -> float:
     """Return the standard deviation of the columns' own response, averaged over the arms."""
     inner = [row[good] for row, good in zip(shape, usable, strict=True)]
+    # By medians, which outliers hardly change; that of normal deviations is σ/1.4826.
     return float(np.mean([1.4826 * np.median(np.abs(row / np.median(row) - 1)) for row in inner]))
 
 

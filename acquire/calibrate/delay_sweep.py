@@ -140,6 +140,7 @@ def first_sight(point: Point, substep_ticks: int) -> list[float]:
 def lines_for(point: Point, lines: int, substep_ticks: int) -> int:
     """Return the lines per recording for a sweep that is certain to half a tick, within sensible limits."""
     error_ticks = max(each.error for each in point.seen) * substep_ticks
+    # Errors fall with the root of the number of lines.
     wanted = lines * (SWEEP_ERROR * error_ticks / WANTED_TICKS) ** 2
     return int(min(MOST_LINES, max(FIRST_LINES, -(-wanted // 1024) * 1024)))
 
@@ -237,6 +238,7 @@ class _Model:
         start = [self._sight / self._ticks, 1.0, 1.0, 1.0, 1.0, *([0.0] if rounded else [])]
         found = least_squares(self._residual, start, x_scale=0.1)
         spare = found.fun.size - len(start)
+        # A scatter larger than the errors makes them larger; a smaller one is chance, and changes nothing.
         scale = max(1.0, 2 * found.cost / spare) if spare > 0 else 1.0
         slopes = np.asarray(found.jac, np.float64)
         covariance = np.linalg.pinv(slopes.T @ slopes) * scale

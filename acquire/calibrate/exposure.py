@@ -194,6 +194,7 @@ def moments(exposure: Exposure, progress: Progress = no_progress) -> Moments:
         average: NDArray[np.float64] = (values * weights).sum(axis=0) / weights.sum(axis=0).clip(1)
         return average
 
+    # Every block has a mean of its own, so drift does not count as noise; that costs it a degree of freedom.
     mean, variance = pooled(means, counts), pooled(variances, (counts - 1).clip(0))
     errors = np.sqrt(variance / counts.clip(1)[:, :, None]).clip(1e-9)
     return Moments(
@@ -211,6 +212,7 @@ def _block_moments(
     samples: NDArray[Any], usable: NDArray[np.bool_], white: NDArray[Any]
 ) -> tuple[NDArray[Any], ...]:
     lines = samples.astype(np.float64)
+    # Saturated samples are not usable, but show that their line has arrived.
     arrived = np.asarray((usable | (lines >= white)).any(axis=2))
     counts = arrived.sum(axis=1)
     shape = (len(ARMS), lines.shape[2])

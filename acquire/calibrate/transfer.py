@@ -66,6 +66,7 @@ def transfer(
         for i, arm in enumerate(ARMS):
             good = usable[i]
             own, dark = (slope**2 * found.own_variance)[i, good], dark_noise[i, good] ** 2
+            # A variance σ² that was measured with n values has itself a variance of 2σ⁴/n.
             errors = 2 * (own**2 / found.lines[i] + dark**2 / dark_lines)
             points[arm].append(
                 Point(
@@ -77,6 +78,7 @@ def transfer(
             )
     slopes = [_slope(sorted(points[arm], key=lambda point: point.light), arm) for arm in ARMS]
     K, error, full_dn = (np.array(each) for each in zip(*slopes, strict=True))
+    # Rounding to whole DN also scatters the samples, but is no noise of the pixels.
     read = np.sqrt(np.maximum((dark_noise**2).mean(axis=1) - QUANTISATION_DN2, 0)) / K
     read_error = read * np.hypot(error / K, 1 / np.sqrt(2.0 * dark_lines * offset.shape[1]))
     quantities = {"dn_per_electron": Measured(K, error), "read_noise_e": Measured(read, read_error)}
