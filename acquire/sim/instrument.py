@@ -83,13 +83,24 @@ class SimulatedDevices:
 
         Raises ConfigError and UsageError as the class does.
         """
-        if not self.config.needs_scene:
+        config = self.config
+        if not config.needs_scene:
             return
-        file = find(self.config.scene_file(), kind="scene").stat()
+        file = find(config.scene_file(), kind="scene").stat()
         version = (file.st_mtime_ns, file.st_ino)
         if self._scene_version != version:
-            scene = load_scene(self.config.scene_file())
-            _check_scene(self.config, scene)
+            scene = load_scene(config.scene_file())
+            if config.trigger.driver == "rtl" and any(effect.kind == "delays" for effect in scene.effects):
+                raise UsageError(
+                    "effect 'delays' cannot act on the pins of the gateware",
+                    possible="trigger.driver = 'simulated'",
+                )
+            # Each camera is built once here, so that UsageError is not raised in a camera's process.
+            substep_s = config.trigger.substep_ticks / config.trigger.clock_hz
+            cameras = {arm: config.cameras.arm(arm) for arm in ARMS}
+            bench = Bench(scene, config.geometry, cameras, substep_s, fibre=config.laid_out)
+            for arm in ARMS:
+                bench.camera(arm, ConstantCode(0))
             self._scene, self._scene_version = scene, version
 
     def sensor(self, arm: str) -> CameraOpener:
@@ -181,17 +192,3 @@ def _transport(config: RigConfig, wire: Wire, pins: PinPage | None) -> Callable[
     if config.trigger.driver == "rtl":
         return partial(rtl.RtlTransport, clock_hz, pins)
     return partial(TwinTransport, TriggerModel(wire, clock_hz, config.simulation.speed))
-
-
-def _check_scene(config: RigConfig, scene: SceneConfig) -> None:
-    """Build each camera once, so that UsageError is raised here rather than in a camera's process."""
-    if config.trigger.driver == "rtl" and any(effect.kind == "delays" for effect in scene.effects):
-        raise UsageError(
-            "effect 'delays' cannot act on the pins of the gateware", possible="trigger.driver = 'simulated'"
-        )
-    code = ConstantCode(0)
-    substep_s = config.trigger.substep_ticks / config.trigger.clock_hz
-    cameras = {arm: config.cameras.arm(arm) for arm in ARMS}
-    bench = Bench(scene, config.geometry, cameras, substep_s, fibre=config.laid_out)
-    for arm in ARMS:
-        bench.camera(arm, code)

@@ -114,7 +114,11 @@ class SeparableLines:
         for column in range(1, substeps):
             pixels += masks[:, :, column::substeps]
         # A mask covers few rows, and the others would add nothing to the product.
-        self._rows = [_covered_rows(mask) for mask in pixels]
+        self._rows = []
+        for mask in pixels:
+            covered = np.flatnonzero(mask.any(axis=1))
+            rows = slice(int(covered[0]), int(covered[-1]) + 1) if len(covered) else slice(0, 1)
+            self._rows.append(rows)
         self._weights = np.concatenate([mask[rows] for mask, rows in zip(pixels, self._rows, strict=True)])
         self._windows = np.empty((TILE_LINES, len(self._weights)), np.float32)
         self._tile_index: int | None = None
@@ -228,9 +232,3 @@ def arm_view(video: NDArray[Any], optics: ArmOptics) -> NDArray[Any]:
     """Return frames (…, row, column) as an arm sees them: mirrored, then rotated counter-clockwise."""
     mirrored = video[:, :, ::-1] if optics.mirror else video
     return np.rot90(mirrored, optics.turn_deg // 90, axes=(1, 2))
-
-
-def _covered_rows(mask: NDArray[np.float32]) -> slice:
-    """Return the rows of (row, pixel) from the first to the last that is not all 0; one row if all are."""
-    covered = np.flatnonzero(mask.any(axis=1))
-    return slice(int(covered[0]), int(covered[-1]) + 1) if len(covered) else slice(0, 1)

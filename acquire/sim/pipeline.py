@@ -252,24 +252,23 @@ class _Image:
         self._recent: dict[int, NDArray[np.float32]] = {}
 
     def lines(self, first_line: int, count: int) -> NDArray[Any]:
-        lines: NDArray[Any] = (
-            self._with_history(first_line, count) if self._lead else self._arm.lines(first_line, count)
-        )
+        lines: NDArray[Any]
+        if self._lead:
+            # The effects need ``lead`` more lines before these. The last tiles are kept for the next call.
+            first = first_line - self._lead
+            tiles = range(first // TILE_LINES, (first_line + count - 1) // TILE_LINES + 1)
+            for index in tiles:
+                if index not in self._recent:
+                    self._recent[index] = self._arm.lines(index * TILE_LINES, TILE_LINES)
+            begin = first % TILE_LINES
+            lines = np.concatenate([self._recent[index] for index in tiles])
+            lines = lines[begin : begin + self._lead + count].astype(np.float64)
+            self._recent = {index: self._recent[index] for index in tiles[-3:]}
+        else:
+            lines = self._arm.lines(first_line, count)
         for stage in self._signal:
             lines = stage.run(lines, first_line)
         return lines
-
-    def _with_history(self, first_line: int, count: int) -> NDArray[Any]:
-        """Return the lines, preceded by ``lead`` others; the last tiles are kept for the next call."""
-        first = first_line - self._lead
-        tiles = range(first // TILE_LINES, (first_line + count - 1) // TILE_LINES + 1)
-        for index in tiles:
-            if index not in self._recent:
-                self._recent[index] = self._arm.lines(index * TILE_LINES, TILE_LINES)
-        skip = first % TILE_LINES
-        lines = np.concatenate([self._recent[index] for index in tiles])[skip : skip + self._lead + count]
-        self._recent = {index: self._recent[index] for index in tiles[-3:]}
-        return lines.astype(np.float64)
 
 
 def describe(scene: SceneConfig) -> dict[str, Any]:

@@ -168,9 +168,8 @@ class TriggerModel:
             return FrameType.DATA, write_payload(address, self.registers.read(address, count))
         if frame.type == FrameType.WRITE:
             address, words = parse_write(frame.payload)
-            self._feed_watchdog(
-                self._tick()
-            )  # before the words: a refused one also shows that the host lives
+            # Before the words, since a refused one also shows that the host lives.
+            self._feed_watchdog(self._tick())
             for i, word in enumerate(words):
                 self.registers.write(address + i, word)
             return FrameType.ACK, frame.payload[:2] + bytes([len(words)])
@@ -239,9 +238,8 @@ class TriggerModel:
         latency = START_LATENCY + self._lead()
         run.start_tick, run.state, run.external = now_tick + latency, State.RUNNING, external
         rate = self._clock_hz * self._speed / NS_PER_S
-        start_ns = now_ns + -(
-            -latency * rate.denominator // rate.numerator
-        )  # rounded up: not before its tick
+        # Rounded up: not before its tick.
+        start_ns = now_ns + -(-latency * rate.denominator // rate.numerator)
         self._zero = (start_ns, run.start_tick, self._speed)
         self._feed_watchdog(run.start_tick - self._lead() - RUN_CLOCKS)
         period_ns = Fraction(run.line_clocks * NS_PER_S, self._clock_hz)
@@ -297,13 +295,7 @@ class TriggerModel:
         lines = self._wire.read().issued
         self._queue_line_tags(run.lines, lines)
         run.lines = lines
-        self._expire(tick)
-        if run.limit is not None and tick >= (end := run.start_tick + run.limit * run.line_clocks):
-            self._finish(run.reason, end)
-
-    def _expire(self, tick: int) -> None:
-        """Begin to stop when the budget's last line begins or the watchdog expires, whichever comes first."""
-        run = self._run
+        # The budget's last line or the watchdog begins the stop, whichever comes first.
         ends = [(run.bark_tick, EndReason.WATCHDOG)] if run.bark_tick is not None else []
         if run.budget is not None:
             ends.append((run.start_tick + (run.budget - 1) * run.line_clocks, EndReason.LINE_BUDGET))
@@ -311,6 +303,8 @@ class TriggerModel:
             first_tick, reason = min(ends, key=lambda end: end[0])
             if tick >= first_tick:
                 run.state, run.reason, run.limit = State.STOPPING, reason, self._lines_allowed()
+        if run.limit is not None and tick >= (end := run.start_tick + run.limit * run.line_clocks):
+            self._finish(run.reason, end)
 
     def _end(self, reason: EndReason) -> None:
         """End the run: at once before line 0, else after the current line, which cameras may have seen."""

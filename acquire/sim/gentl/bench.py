@@ -54,7 +54,16 @@ class GentlBench:
         self.cameras: dict[str, CameraMemory] = {}
         self._feeders: list[Worker] = []
         try:
-            self._fill(producer, cameras, life)
+            # A copy, not a link: the producer looks for its cameras in its own directory.
+            shutil.copy(producer, self.cti)
+            (self._directory / layout.HOST_FILE).write_bytes(host_ports())
+            for model, opener in cameras.items():
+                memory = self.cameras[model.serial] = CameraMemory(model)
+                (self._directory / f"{model.serial}{layout.SUFFIX}").symlink_to(memory.path)
+                self._feeders.append(Worker(f"sensor {model.serial}", life, memory, opener))
+            deadline = time.monotonic() + _START_S
+            for feeder in self._feeders:
+                feeder.expect(Ready, deadline)
         except BaseException:
             self.close()
             raise
@@ -63,18 +72,6 @@ class GentlBench:
     def cti(self) -> Path:
         """Path of the producer."""
         return self._directory / CTI
-
-    def _fill(self, producer: Path, cameras: Mapping[CameraModel, Any], life: Callable[..., None]) -> None:
-        # A copy, not a link: the producer looks for its cameras in its own directory.
-        shutil.copy(producer, self.cti)
-        (self._directory / layout.HOST_FILE).write_bytes(host_ports())
-        for model, opener in cameras.items():
-            memory = self.cameras[model.serial] = CameraMemory(model)
-            (self._directory / f"{model.serial}{layout.SUFFIX}").symlink_to(memory.path)
-            self._feeders.append(Worker(f"sensor {model.serial}", life, memory, opener))
-        deadline = time.monotonic() + _START_S
-        for feeder in self._feeders:
-            feeder.expect(Ready, deadline)
 
     def close(self) -> None:
         """End the feeders, and remove the cameras and the directory. Idempotent."""

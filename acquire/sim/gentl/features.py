@@ -126,26 +126,21 @@ class Module:
         )
 
     def _integer(self, feature: Feature, selected: str) -> str:
-        maximum, swiss_knife = self._maximum(feature)
+        if isinstance(feature.maximum, str):  # a formula, which needs a node of its own
+            name = f"{feature.name}Max"
+            variables = "".join(
+                f'<pVariable Name="{variable}">{of}Reg</pVariable>' for variable, of in feature.of.items()
+            )
+            formula = f"<Formula>{escape(feature.maximum)}</Formula>"
+            maximum = f"<pMax>{name}</pMax>"
+            swiss_knife = f'<IntSwissKnife Name="{name}">{variables}{formula}</IntSwissKnife>\n'
+        else:
+            maximum, swiss_knife = f"<Max>{int(feature.maximum)}</Max>", ""
         unit = f"<Unit>{feature.unit}</Unit>" if feature.unit else ""
         return (
             f'<Integer Name="{feature.name}">{_common(feature)}<pValue>{feature.name}Reg</pValue>'
             f"<Min>{int(feature.minimum)}</Min>{maximum}<Inc>{feature.increment}</Inc>{unit}{selected}"
             f"</Integer>\n{swiss_knife}{self._register(feature, 'IntReg', _INT)}"
-        )
-
-    def _maximum(self, feature: Feature) -> tuple[str, str]:
-        """Return the element for an integer's maximum, and the IntSwissKnife node of its formula, if any."""
-        if not isinstance(feature.maximum, str):
-            return f"<Max>{int(feature.maximum)}</Max>", ""
-        name = f"{feature.name}Max"
-        variables = "".join(
-            f'<pVariable Name="{variable}">{of}Reg</pVariable>' for variable, of in feature.of.items()
-        )
-        formula = f"<Formula>{escape(feature.maximum)}</Formula>"
-        return (
-            f"<pMax>{name}</pMax>",
-            f'<IntSwissKnife Name="{name}">{variables}{formula}</IntSwissKnife>\n',
         )
 
     def _real(self, feature: Feature, selected: str) -> str:
