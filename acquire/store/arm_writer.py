@@ -81,7 +81,20 @@ class ArmWriter:
 
     def append(self, block: TaggedBlock, behind: ThreadPoolExecutor | None) -> None:
         """Append the block. With ``behind``, a thread that writes, it is lent until `give_back`."""
-        self._check(block)
+        # All is checked before any array takes a row: the arrays of an arm have the same rows.
+        if block.first_line != self.next_line:
+            raise DataError(
+                f"arm {block.arm}: the next block cannot begin at line {block.first_line}",
+                possible=f"line {self.next_line}, the next; a lost line keeps its row, flagged as missing",
+            )
+        for column, array in self._arrays.items():
+            rows = getattr(block, column.source)
+            expected = (len(block), *array.shape.row_shape)
+            if rows.shape != expected or rows.dtype != array.shape.dtype:
+                raise DataError(
+                    f"arm {block.arm}: {column.source} of a block is {rows.dtype} {rows.shape}",
+                    possible=f"{array.shape.dtype} {expected}",
+                )
         for column, array in reversed(self._arrays.items()):  # pixels last: rows that they have, all have
             array.append(getattr(block, column.source), behind)
 
@@ -128,18 +141,3 @@ class ArmWriter:
         for name, document in (documents | {"": group}).items() if own else ():
             publisher.replace(self.directory / name / "zarr.json", layout.to_json(document))
         return {arm: group} | {f"{arm}/{name}": document for name, document in documents.items()}
-
-    def _check(self, block: TaggedBlock) -> None:
-        if block.first_line != self.next_line:
-            raise DataError(
-                f"arm {block.arm}: the next block cannot begin at line {block.first_line}",
-                possible=f"line {self.next_line}, the next; a lost line keeps its row, flagged as missing",
-            )
-        for column, array in self._arrays.items():
-            rows = getattr(block, column.source)
-            expected = (len(block), *array.shape.row_shape)
-            if rows.shape != expected or rows.dtype != array.shape.dtype:
-                raise DataError(
-                    f"arm {block.arm}: {column.source} of a block is {rows.dtype} {rows.shape}",
-                    possible=f"{array.shape.dtype} {expected}",
-                )

@@ -156,33 +156,25 @@ class ArrayWriter:
         if self._pool is None and self._filled == 0:
             self.finish()  # the piece on its way may be in the buffer
         if self._filled == 0 and len(rows) >= size and rows.flags.c_contiguous:
+            whole = len(rows) // size
             if self._pool is None:
-                return self._write_whole(rows)
-            if self._behind is not None:
-                return self._encode_whole(rows, self._pool)
+                whole = min(whole, self._with_room().room)
+                self._write(
+                    [self._encode(rows[k * size : (k + 1) * size], self._chunks + k) for k in range(whole)]
+                )
+                return whole * size
+            if self._behind is not None:  # then the rows are lent, and can be encoded in place
+                self._write_encoded()
+                for k in range(whole):
+                    chunk = rows[k * size : (k + 1) * size]
+                    self._encoding.append((self._pool.submit(encode, chunk, self.shape.codec), None))
+                return whole * size
         count = min(size - self._filled, len(rows))
         self._buffer[self._filled : self._filled + count] = rows[:count]
         self._filled += count
         if self._filled == size:
             self._flush()
         return count
-
-    def _write_whole(self, rows: NDArray[Any]) -> int:
-        """Write the whole chunks at the start of ``rows`` that the file has room for; return their rows."""
-        size = self.shape.chunk_rows
-        count = min(len(rows) // size, self._with_room().room)
-        self._write([self._encode(rows[k * size : (k + 1) * size], self._chunks + k) for k in range(count)])
-        return count * size
-
-    def _encode_whole(self, rows: NDArray[Any], pool: ThreadPoolExecutor) -> int:
-        """Have the whole chunks at the start of ``rows`` encoded in place; return their number of rows."""
-        self._write_encoded()
-        size = self.shape.chunk_rows
-        whole = len(rows) // size
-        for k in range(whole):
-            chunk = rows[k * size : (k + 1) * size]
-            self._encoding.append((pool.submit(encode, chunk, self.shape.codec), None))
-        return whole * size
 
     def _flush(self) -> None:
         self._filled = 0

@@ -17,7 +17,7 @@ Rows that are missing in either are compared only by their flags and gaps.
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -79,8 +79,10 @@ def compare(
         for arm in ARMS:
             old, new = _read(first, arm, start + shift, stop + shift), _read(second, arm, start, stop)
             _count_from_zero(first, second, old, new, ticks)
-            for difference in _of_block(arm, start, old, new):
-                _add(by_array, difference)
+            for found_here in _of_block(arm, start, old, new):
+                before = by_array.setdefault(found_here.array, found_here)
+                if before is not found_here:  # the first difference stays, and the number grows
+                    by_array[before.array] = replace(before, rows=before.rows + found_here.rows)
         if progress is not None:
             progress(stop, rows)
     return [*found, *by_array.values(), *_of_gaps(first, second, shift, rows)]
@@ -139,16 +141,6 @@ def _shown(value: Any) -> str:
     if np.ndim(value) == 0:
         return str(value)
     return f"[{' '.join(map(str, value[:4]))}{' …' if len(value) > 4 else ''}]"
-
-
-def _add(found: dict[str, Difference], new: Difference) -> None:
-    before = found.get(new.array)
-    rows = new.rows + (0 if before is None else before.rows)
-    found[new.array] = Difference(
-        new.array,
-        rows,
-        *((new.row, new.first, new.second) if before is None else (before.row, before.first, before.second)),
-    )
 
 
 def _of_gaps(first: Recording, second: Recording, shift: int, rows: int) -> Iterator[Difference]:

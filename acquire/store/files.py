@@ -38,23 +38,19 @@ NO_LOCKS = (errno.ENOLCK, errno.EOPNOTSUPP, errno.ENOSYS)
 
 def check_new_path(path: Path) -> None:
     """Raise UsageError unless something new can be created at ``path``. Touches nothing."""
-    if _is_taken(path):
+    try:
+        os.lstat(path)
+    except (FileNotFoundError, NotADirectoryError):
+        pass
+    except (OSError, ValueError) as error:  # too long, a circle of links, NUL, not encodable
+        reason = error.strerror if isinstance(error, OSError) else error
+        raise UsageError(f"{str(path)!r} cannot be a path: {reason}", hint="another name") from error
+    else:
         raise UsageError(f"{path} exists already", hint="another name; nothing is ever overwritten")
     if not path.parent.is_dir():
         raise UsageError(f"{path}: the directory {path.parent} does not exist", hint="create it first")
     if not os.access(path.parent, os.W_OK | os.X_OK):
         raise UsageError(f"{path}: the directory {path.parent} is not writable", hint="another directory")
-
-
-def _is_taken(path: Path) -> bool:
-    try:
-        os.lstat(path)
-    except (FileNotFoundError, NotADirectoryError):
-        return False
-    except (OSError, ValueError) as error:  # too long, a circle of links, NUL, not encodable
-        reason = error.strerror if isinstance(error, OSError) else error
-        raise UsageError(f"{str(path)!r} cannot be a path: {reason}", hint="another name") from error
-    return True
 
 
 def write_all(fd: int, parts: Sequence[Buffer], offset: int) -> None:

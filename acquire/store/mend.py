@@ -35,23 +35,18 @@ def mend_index(disk: Disk, path: Path, reader: ChunkReader, shard: int, *, grow:
         if intact or _holds(reader, first + slot, offset, size):
             mended[slot] = offset, size
     if grow:
-        _grow(reader, first, mended)
+        slot = max((slot + 1 for slot, (offset, _) in enumerate(mended) if offset != ABSENT), default=0)
+        offset = page_up(sum(mended[slot - 1])) if slot else PAGE
+        while slot < len(mended):
+            size = reader.size_at(first + slot, offset)
+            if not _holds(reader, first + slot, offset, size):
+                break
+            mended[slot] = offset, size
+            slot, offset = slot + 1, page_up(offset + size)
     if intact and mended == entries:
         return False
     disk.patch(path / reader.shard_file(shard), pack_index(mended), 0)
     return True
-
-
-def _grow(reader: ChunkReader, first: int, entries: list[tuple[int, int]]) -> None:
-    """Add the chunks that follow the last one in ``entries``; chunk ``first`` is in slot 0."""
-    slot = max((slot + 1 for slot, (offset, _) in enumerate(entries) if offset != ABSENT), default=0)
-    offset = page_up(sum(entries[slot - 1])) if slot else PAGE
-    while slot < len(entries):
-        size = reader.size_at(first + slot, offset)
-        if not _holds(reader, first + slot, offset, size):
-            return
-        entries[slot] = offset, size
-        slot, offset = slot + 1, page_up(offset + size)
 
 
 def rewrite_chunk(disk: Disk, path: Path, reader: ChunkReader, chunk: int, rows: NDArray[Any]) -> None:

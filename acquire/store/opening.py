@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from acquire.codes import code_from_attrs
@@ -81,20 +82,13 @@ def _no_root(source: Source) -> AcquireError:
     with refused(source, "read"):
         if not source.exists():
             return PlaceError(f"{source} does not exist", hint=hint)
-        if _has(source, f"{ARMS[0]}/lines/zarr.json"):
+        with suppress(FileNotFoundError, NotADirectoryError):
+            source.size(f"{ARMS[0]}/lines/zarr.json")
             return DataError(
                 f"{source} is a recording whose root metadata, zarr.json, is missing",
                 hint=f"acquire recover {source}; the lines themselves are still in a/ and b/",
             )
     return PlaceError(f"{source} is not a recording: it holds no zarr.json", hint=hint)
-
-
-def _has(source: Source, key: str) -> bool:
-    try:
-        source.size(key)
-    except (FileNotFoundError, NotADirectoryError):
-        return False
-    return True
 
 
 def _check_object(attributes: Any) -> None:

@@ -74,7 +74,11 @@ def rebuild_root(path: Path, disk: Disk) -> None:
             hint="a copy of the recording, or of its zarr.json",
         )
     nodes = _arms(path, attributes) | gap_table(path).nodes() | event_table(path).nodes()
-    nodes |= _tables(path)
+    # Tables and overview as far as they exist, since the lines do not depend on them.
+    for keys in (gap_table(path).nodes(), event_table(path).nodes(), overview.KEYS):
+        own = {key: _own(path / key) for key in keys}
+        if all(own.values()):
+            nodes |= {key: layout.inner(document) for key, document in own.items() if document}
     try:
         if (path / ROOT).exists():
             disk.rename(path / ROOT, path / DAMAGED_ROOT)
@@ -120,16 +124,6 @@ def _arms(path: Path, attributes: dict[str, Any]) -> dict[str, layout.Document]:
         ordered[arm] = layout.group_document({"arm": arm, **group}, {})
         ordered |= {key: node for key, node in nodes.items() if key.startswith(f"{arm}/")}
     return ordered
-
-
-def _tables(path: Path) -> dict[str, layout.Document]:
-    """Return the metadata of tables and overview, as far as it exists: the lines do not depend on it."""
-    nodes: dict[str, layout.Document] = {}
-    for keys in (gap_table(path).nodes(), event_table(path).nodes(), overview.KEYS):
-        own = {key: _own(path / key) for key in keys}
-        if all(own.values()):
-            nodes |= {key: document for key, document in own.items() if document}
-    return {key: layout.inner(document) for key, document in nodes.items()}
 
 
 def _own(directory: Path) -> layout.Document | None:

@@ -167,7 +167,13 @@ class _Recoverer:
         mended = sum(self._mend(arm) for arm in ARMS)
         scans = scan(recording, self.kept, progress)
         if not self.sealed:
-            self.rows = self._grown()
+            # Chunk after chunk of the tag arrays: the first one that is not whole, in any array of either
+            # arm, is where the writer was.
+            grown = self.tag_rows
+            while self.rows % self.tag_rows == 0 and grown:
+                beyond = range(self.rows, self.rows + self.tag_rows)
+                grown = min(grown_rows(found, beyond) for found in scan(recording, [beyond]).values())
+                self.rows += grown
         damage = tuple(found for arm in scans.values() for found in arm.damages(recording.lines))
         new_gaps = {arm: self._flag(found) for arm, found in scans.items()}
         changed = bool(not self.sealed or mended or self.flags_changed or any(new_gaps.values()))
@@ -196,17 +202,6 @@ class _Recoverer:
                 if shard >= first_shard
             )
         return mended
-
-    def _grown(self) -> int:
-        """Return the number of rows, including uncommitted ones that are whole on disk in every array."""
-        # Chunk after chunk of the tag arrays: the first one that is not whole, in any array of either arm, is
-        # where the writer was.
-        rows, grown = self.recording.lines, self.tag_rows
-        while rows % self.tag_rows == 0 and grown:
-            beyond = range(rows, rows + self.tag_rows)
-            grown = min(grown_rows(found, beyond) for found in scan(self.recording, [beyond]).values())
-            rows += grown
-        return rows
 
     def _flag(self, found: ArmScan) -> list[tuple[int, int, str]]:
         """Flag the lost rows of one arm; return the gaps to be listed: first line, count, cause."""
@@ -240,7 +235,14 @@ class _Recoverer:
         document = copy.deepcopy(self.recording.document)
         nodes: dict[str, layout.Document] = document["consolidated_metadata"]["metadata"]
         nodes |= self._tables(publisher, new_gaps)
-        self._resize(publisher, nodes)
+        # Also into the arms' own metadata, for readers that begin below the root.
+        for arm in ARMS:
+            arrays = {name: nodes[f"{arm}/{name}"] for name in COLUMNS}
+            for name, array in arrays.items():
+                array["shape"] = [self.rows, *array["shape"][1:]]
+                publisher.replace(self.path / arm / name / "zarr.json", layout.to_json(array))
+            group = layout.group_document(nodes[arm]["attributes"], arrays)
+            publisher.replace(self.path / arm / "zarr.json", layout.to_json(group))
         document["attributes"] = self._attributes(new_gaps)
         self.disk.sync_tree(self.path)  # everything that the root is going to describe
         write_copy(publisher, self.path, document["attributes"], durable=True)
@@ -291,16 +293,6 @@ class _Recoverer:
             with contextlib.suppress(AbsentChunkError, DamagedChunkError, OSError):
                 return int(self.recording.arms[arm].reader("tick").chunk(chunk)[row])
         return 0
-
-    def _resize(self, publisher: Publisher, nodes: dict[str, layout.Document]) -> None:
-        """Write the lengths into the arms' own metadata, for readers that begin below the root."""
-        for arm in ARMS:
-            arrays = {name: nodes[f"{arm}/{name}"] for name in COLUMNS}
-            for name, array in arrays.items():
-                array["shape"] = [self.rows, *array["shape"][1:]]
-                publisher.replace(self.path / arm / name / "zarr.json", layout.to_json(array))
-            group = layout.group_document(nodes[arm]["attributes"], arrays)
-            publisher.replace(self.path / arm / "zarr.json", layout.to_json(group))
 
     def _attributes(self, new_gaps: dict[str, list[tuple[int, int, str]]]) -> dict[str, Any]:
         attributes = dict(self.recording.attrs)

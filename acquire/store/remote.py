@@ -279,15 +279,12 @@ def _as_os_errors() -> Iterator[None]:
         yield
     except tuple(_store_errors()) as error:
         text = _ATTEMPTS.sub("", str(error).partition("\n")[0].partition(": <?xml")[0])
-        raise _kind_of(error, text)(text[:300]) from error
-
-
-def _kind_of(error: Exception, text: str) -> type[OSError]:
-    """Return the OSError class: obstore's exception gives most reasons, a listing only the HTTP status."""
-    status = _STATUS.search(text)
-    if status is not None and status[1] in _STATUS_ERRORS:
-        return _STATUS_ERRORS[status[1]]
-    return next(kind for known, kind in _store_errors().items() if isinstance(error, known))
+        kind = next(kind for known, kind in _store_errors().items() if isinstance(error, known))
+        # obstore's exception gives most reasons, but that of a listing only the HTTP status.
+        status = _STATUS.search(text)
+        if status is not None:
+            kind = _STATUS_ERRORS.get(status[1], kind)
+        raise kind(text[:300]) from error
 
 
 @cache

@@ -50,7 +50,13 @@ def remove(disk: Disk, path: Path, proof: Unborn | Dropped) -> None:
     """
     match proof:
         case Unborn(committed_lines):
-            _check_unborn(path, committed_lines)
+            if committed_lines:
+                raise DataError(f"{path} is not removed: {committed_lines} lines of it were committed")
+            refuse_links(path)
+            for directory, _, names in os.walk(path):
+                if odd := sorted(set(names) - _MADE_FIRST):
+                    held = f"{os.path.relpath(directory, path)}/{odd[0]}"
+                    raise DataError(f"{path} is not removed: it holds {held}")
             disk.remove_tree(path)
         case Dropped(shard, listed):
             if not any(shard in shards for shards in listed):
@@ -93,13 +99,3 @@ def shard_numbers(array: Path) -> list[int]:
         raise DataError(f"{array} cannot be listed: {error.strerror}") from error
     short = (name for name in names if name.isascii() and name.isdecimal() and len(name) < 19)
     return sorted(int(name) for name in short if str(int(name)) == name)
-
-
-def _check_unborn(path: Path, committed_lines: int) -> None:
-    if committed_lines:
-        raise DataError(f"{path} is not removed: {committed_lines} lines of it were committed")
-    refuse_links(path)
-    for directory, _, names in os.walk(path):
-        if odd := sorted(set(names) - _MADE_FIRST):
-            held = f"{os.path.relpath(directory, path)}/{odd[0]}"
-            raise DataError(f"{path} is not removed: it holds {held}")

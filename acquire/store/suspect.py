@@ -49,19 +49,16 @@ class Suspect:
 
 def suspect_lines(recording: Outline) -> tuple[Suspect, ...]:
     """Return the suspect lines of both arms, in order. Raises DataError if the events cannot be read."""
-    return tuple(found for arm in ARMS for found in _of_arm(recording, arm))
-
-
-def _of_arm(recording: Outline, arm: str) -> list[Suspect]:
     end = recording.first_line + recording.lines
     found: list[Suspect] = []
-    doubt: tuple[int, str] | None = None
-    for event in recording.events:
-        if event.kind == DOUBTFUL[arm] and doubt is None:
-            doubt = event.line, event.text
-        elif event.kind == VERIFIED[arm] and doubt is not None:
-            found.append(Suspect(arm, doubt[0], min(event.line, end) - doubt[0], doubt[1]))
-            doubt = None
-    if doubt is not None:
-        found.append(Suspect(arm, doubt[0], end - doubt[0], doubt[1]))
-    return [one for one in found if one.count > 0]
+    for arm in ARMS:
+        doubt: tuple[int, str] | None = None
+        for event in recording.events:
+            if event.kind == DOUBTFUL[arm] and doubt is None:
+                doubt = event.line, event.text
+            elif event.kind == VERIFIED[arm] and doubt is not None:
+                found.append(Suspect(arm, doubt[0], min(event.line, end) - doubt[0], doubt[1]))
+                doubt = None
+        if doubt is not None:
+            found.append(Suspect(arm, doubt[0], end - doubt[0], doubt[1]))
+    return tuple(one for one in found if one.count > 0)

@@ -89,7 +89,12 @@ class Table:
             self.not_listed += 1
             return
         for column in self._columns:
-            self._cells[column.name].append(_cell(column, row[column.name]))
+            value = row[column.name]
+            if column.vocabulary is not None:
+                value = column.vocabulary.value(value)
+            elif column.data_type == "string" and len(value) > MAX_TEXT:
+                value = value[: MAX_TEXT - 1] + "…"
+            self._cells[column.name].append(value)
 
     def create(self, disk: Disk) -> None:
         for column in self._columns:
@@ -105,7 +110,15 @@ class Table:
         for column in self._columns:
             place = self.directory / column.name
             if len(self):
-                publisher.replace(place / "c" / "0", self._chunk(column), durable=durable)
+                cells = self._cells[column.name]
+                if column.data_type == "string":
+                    padding = [""] * (self.capacity - len(self))
+                    data = bytes(VLenUTF8().encode(np.array(cells + padding, object)))
+                else:
+                    whole = np.zeros(self.capacity, np.dtype(column.data_type).newbyteorder("<"))
+                    whole[: len(self)] = cells
+                    data = whole.tobytes()
+                publisher.replace(place / "c" / "0", data + crc32c(data), durable=durable)
             publisher.replace(place / "zarr.json", layout.to_json(self._array(column)))
         publisher.replace(self.directory / "zarr.json", layout.to_json(self._group()))
         self.dirty = False
@@ -129,16 +142,6 @@ class Table:
             codecs=[serializer, layout.CRC32C],
             attributes=column.describe(),
         )
-
-    def _chunk(self, column: TableColumn) -> bytes:
-        cells = self._cells[column.name]
-        if column.data_type == "string":
-            data = bytes(VLenUTF8().encode(np.array(cells + [""] * (self.capacity - len(self)), object)))
-        else:
-            whole = np.zeros(self.capacity, np.dtype(column.data_type).newbyteorder("<"))
-            whole[: len(self)] = cells
-            data = whole.tobytes()
-        return data + crc32c(data)
 
 
 def gap_table(path: Path) -> Table:
@@ -165,11 +168,3 @@ def event_table(path: Path) -> Table:
         TableColumn("text", "string", {"long_name": "details"}),
     )
     return Table(path / "events", "event", columns, EVENT_ROWS)
-
-
-def _cell(column: TableColumn, value: Any) -> Any:
-    if column.vocabulary is not None:
-        return column.vocabulary.value(value)
-    if column.data_type == "string" and len(value) > MAX_TEXT:
-        return value[: MAX_TEXT - 1] + "…"
-    return value

@@ -69,7 +69,11 @@ class _Table:
                 raise ValueError(f"it has {rows} cells of type {data_type}")
             if rows == 0:
                 return []
-            data = self._chunk(column)
+            # The column's only chunk, which may have more rows than the root states.
+            chunk = self.source.read(f"{self.name}/{column}/c/0")
+            data, checksum = chunk[:-CRC_BYTES], chunk[-CRC_BYTES:]
+            if small_crc32c(data) != checksum:
+                raise ValueError("the checksum is wrong")
             if data_type == "string":
                 return _texts(data, rows)
             # With struct, since listing recordings should not wait for numpy to load.
@@ -90,14 +94,6 @@ class _Table:
             return [by_value[value] for value in values]
         except PARSE_ERRORS as error:
             raise DataError(f"{self.source}: table {self.name}/{column} cannot be read: {error!r}") from error
-
-    def _chunk(self, column: str) -> bytes:
-        """Return the column's only chunk, which may have more rows than the root states."""
-        data = self.source.read(f"{self.name}/{column}/c/0")
-        payload, checksum = data[:-CRC_BYTES], data[-CRC_BYTES:]
-        if small_crc32c(payload) != checksum:
-            raise ValueError("the checksum is wrong")
-        return payload
 
 
 def _texts(data: bytes, rows: int) -> list[str]:

@@ -129,18 +129,15 @@ class VideoWriter:
                 column.resize((self.frames,))
                 column[:] = (int(first) <= frame) & (frame < int(end))
                 self._columns["trusted"] = column
-            self._publish(provenance, min(int(first), self.frames - 1))
+            # Consolidated by hand, since the columns are not to be listed, and zarr-python would warn.
+            self._levels[0].update_attributes({"coordinates": layout.coordinates_of(tuple(self._columns))})
+            count, shown = len(self._levels), min(int(first), self.frames - 1)
+            ome = layout.ome_attributes(self._name, self._grid, count, self._window, shown)
+            attributes = {"format": layout.FORMAT, "ome": ome, "provenance": dict(provenance)}
+            partial = self._delivery.partial
+            nodes = {str(n): json.loads((partial / str(n) / "zarr.json").read_bytes()) for n in range(count)}
+            (partial / "zarr.json").write_bytes(to_json(group_document(attributes, nodes)))
         self._delivery.deliver()
-
-    def _publish(self, provenance: Mapping[str, Any], first_frame: int) -> None:
-        # Consolidated by hand, since the columns are not to be listed, and zarr-python would warn.
-        self._levels[0].update_attributes({"coordinates": layout.coordinates_of(tuple(self._columns))})
-        count = len(self._levels)
-        ome = layout.ome_attributes(self._name, self._grid, count, self._window, first_frame)
-        attributes = {"format": layout.FORMAT, "ome": ome, "provenance": dict(provenance)}
-        partial = self._delivery.partial
-        nodes = {str(n): json.loads((partial / str(n) / "zarr.json").read_bytes()) for n in range(count)}
-        (partial / "zarr.json").write_bytes(to_json(group_document(attributes, nodes)))
 
     def _flush(self, *, whole_chunks: bool) -> None:
         video, *columns = (np.concatenate(parts) for parts in zip(*self._chunk, strict=True))

@@ -269,7 +269,18 @@ class RecordingWriter:
                     arm.sync()
             if own := time.monotonic() >= self._own_due_s:
                 self._own_due_s = time.monotonic() + OWN_INTERVAL_S
-            self._publish_kept(rows, self._publish_parts(rows, own=own), room)
+            nodes = self._publish_parts(rows, own=own)
+            # The lines that retention drops are not committed any more; only then are their files deleted.
+            looked, self._looked = self._looked is not room, room
+            going = self._keeper.choose(rows, -room.free_bytes if looked else 0) if self._keeper else []
+            if looked:
+                self._stuck = room.full and not going
+            if going:
+                self._publish_copy()
+            self._publish_root(rows, nodes)
+            # Shards that could not be deleted, or were held in the meantime, are listed again.
+            if self._keeper and self._keeper.delete(going):
+                self._publish_root(rows, nodes)
 
     @property
     def room(self) -> Room:
@@ -375,19 +386,6 @@ class RecordingWriter:
             self._no_overview = str(error) or "no memory"
             withdraw_overview(self._disk, self.path)
             return {}
-
-    def _publish_kept(self, rows: int, nodes: dict[str, layout.Document], room: Room) -> None:
-        """Commit without the lines that retention drops, then delete their files."""
-        looked, self._looked = self._looked is not room, room
-        going = self._keeper.choose(rows, -room.free_bytes if looked else 0) if self._keeper else []
-        if looked:
-            self._stuck = room.full and not going
-        if going:
-            self._publish_copy()
-        self._publish_root(rows, nodes)
-        # Shards that could not be deleted, or were held in the meantime, are listed again.
-        if self._keeper and self._keeper.delete(going):
-            self._publish_root(rows, nodes)
 
     def _publish_root(
         self, rows: int, nodes: dict[str, layout.Document], ending: Ending | None = None
