@@ -199,6 +199,7 @@ def _check_curve(values: NDArray[np.float64], interval_s: float, harmonics: int)
 def _spectrum_peak(values: NDArray[np.float64], interval_s: float) -> float:
     size = SPECTRUM_PADDING * len(values)
     spectrum = np.abs(np.fft.rfft(values - values.mean(), size))
+    # Without its ends: no sinusoid of frequency 0, or of half the sampling rate, can be fitted.
     peak = 1 + int(np.argmax(spectrum[1:-1]))
     return peak / (size * interval_s)
 

@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from acquire.evaluate.curves import CurveComparison
-    from acquire.evaluate.result import DemoResult, Region
+    from acquire.evaluate.result import DemoResult
     from acquire.evaluate.themed import Drawing
 
 FRAME_COLUMNS = 6
@@ -117,7 +117,12 @@ def intensity_curves(result: DemoResult) -> Figure:
     axes = figure.subplots(len(result.regions), 3, squeeze=False, width_ratios=[1, 4.6, 2.1])
     for row, (where, whole, detail) in enumerate(axes):
         window = _detail_window(result, row)
-        _show_region(where, result, result.regions[row])
+        region = result.regions[row]
+        where.imshow(result.truth.mean(axis=0), cmap="gray", vmin=0)
+        if not region.mask.all():  # a region without an edge has no contour
+            where.contour(region.mask, levels=[0.5], colors=HIGHLIGHT, linewidths=1.2)
+        where.set_ylabel(region.name, fontweight="bold")
+        bare(where)
         _plot_curves(whole, result, row)
         whole.axvspan(*window, color=HIGHLIGHT, alpha=0.2, lw=0)
         whole.set(xlim=(result.frame_ms[0], result.frame_ms[-1]), ylabel="intensity")
@@ -172,14 +177,6 @@ def _detail_window(result: DemoResult, row: int) -> tuple[float, float]:
 def _colour_bar(figure: Figure, row: NDArray[Any], label: str, extend: str) -> None:
     image = row[-1].get_images()[0]
     figure.colorbar(image, ax=list(row), label=label, extend=extend, pad=0.01, aspect=11, shrink=0.9)
-
-
-def _show_region(ax: Axes, result: DemoResult, region: Region) -> None:
-    ax.imshow(result.truth.mean(axis=0), cmap="gray", vmin=0)
-    if not region.mask.all():  # a region without an edge has no contour
-        ax.contour(region.mask, levels=[0.5], colors=HIGHLIGHT, linewidths=1.2)
-    ax.set_ylabel(region.name, fontweight="bold")
-    bare(ax)
 
 
 def _plot_curves(ax: Axes, result: DemoResult, row: int) -> None:

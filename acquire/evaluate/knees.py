@@ -38,6 +38,7 @@ class Band:
 
     def at(self, seconds: float) -> float:
         """Return the median at a time; outside the curve, its first or last value."""
+        # A result holds from its own time on, also if rounding has made ``seconds`` a little smaller.
         place = int(np.searchsorted(self.times_s, seconds * (1 + 1e-9), "right")) - 1
         return float(self.middle[max(place, 0)])
 

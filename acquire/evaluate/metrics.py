@@ -106,7 +106,7 @@ def _mean_squared_error(video: NDArray[Any], truth: NDArray[Any]) -> float:
 
 
 def _decibel(errors: NDArray[np.float64], peak: float) -> NDArray[np.float64]:
-    with np.errstate(divide="ignore"):
+    with np.errstate(divide="ignore"):  # equal arrays give inf
         decibel: NDArray[np.float64] = -10 * np.log10(errors / peak**2)
     return decibel
 

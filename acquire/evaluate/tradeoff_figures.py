@@ -87,6 +87,7 @@ def curves(runs: Sequence[Run], metric: Metric, clock: Clock) -> Figure:
             ax.axhline(mean_db, color=SOFT, lw=1.2, ls=(0, (1, 1.5)), zorder=1, label="the truth's mean")
         _time_axis(ax, CLOCKS[clock])
         _value_axis(ax, metric)
+        # Empty lines for the legend: a solver has many curves and markers, and one entry.
         for line, solver in zip(SOLVER_COLOURS, solvers, strict=False):
             ax.plot([], [], color=line, lw=2.2, label=solver)
         handles, labels = ax.get_legend_handles_labels()
