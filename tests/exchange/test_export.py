@@ -241,6 +241,17 @@ def test_an_overview_is_the_mean_of_the_lines_that_are_there(
         assert not saved["lines"][1, 0].any()
 
 
+def test_damaged_lines_are_left_out_of_averages() -> None:
+    damaged, missing = LineFlag.INCOMPLETE, LineFlag.MISSING
+    lines = np.repeat(np.arange(1, 9, dtype=np.uint16)[:, None], 3, axis=1)
+    flags = np.array([LineFlag.SATURATED, damaged, 0, 0, damaged, damaged, missing, damaged], np.uint16)
+    means = from_recording._means(lines, flags, 2)
+    np.testing.assert_array_equal(means, np.repeat([[1.0], [3.5], [0.0], [0.0]], 3, axis=1))
+    assert from_recording._all_flags(flags, 2).tolist() == [
+        LineFlag.SATURATED, 0, damaged, missing | damaged,
+    ]  # fmt: skip
+
+
 def test_times_choose_lines(cli: Cli, recording: Path, tmp_path: Path) -> None:
     assert cli("export", recording, tmp_path / "l.npz", "--from", "200us", "--to", "0.4ms")[0] == 0
     with np.load(tmp_path / "l.npz") as saved:

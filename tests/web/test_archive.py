@@ -1,0 +1,42 @@
+"""The overview of a recording: its brightest values, without lines that have no image."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from acquire.clock import ClockFit
+from acquire.codes import PrbsCode
+from acquire.lines import ARMS, LineBlock, LineFlag
+from acquire.store import RecordingSpec, RecordingWriter, RunCondition, open_recording
+from acquire.stream.tagger import Tagger
+from acquire.trigger.base import TriggerRun
+from acquire.web.archive import LINES_PER_ROW, LOST_COLOUR, PICTURE_ROWS, _arm_overview
+
+M, LINES, WHITE = 6, LINES_PER_ROW * PICTURE_ROWS, 4095
+
+
+def test_damaged_and_missing_lines_are_shown_as_lost(tmp_path: Path) -> None:
+    code, clock = PrbsCode(15, 77), ClockFit(90_000_000, 1_700_000_000_000_000_000, 100)
+    camera = {"white_dn": WHITE, "black_level_dn": 0.0, "responsivity_dn": 1.0}
+    spec = RecordingSpec(
+        run_id="run-1", stages=M, substeps=2, pixels=M, dtype="uint16", first_line=0, clock=clock,
+        code=code.to_attrs(), substep_ticks=900, trigger={"model": "test"}, config={},
+        cameras={"a": camera, "b": camera}, chunk_lines=16, codec="lz4",
+    )  # fmt: skip
+    tagger = Tagger(TriggerRun("run-1", code, 2, 900, 1), M, clock)
+    tagger.confirmed_end = LINES
+    pixels, flags = np.full((LINES, M), 819, np.uint16), np.zeros(LINES, np.uint16)
+    rows = flags.reshape(PICTURE_ROWS, LINES_PER_ROW)
+    rows[1], rows[2], rows[3, 1:] = LineFlag.INCOMPLETE, LineFlag.MISSING, LineFlag.INCOMPLETE
+    pixels[flags != 0] = WHITE  # what an earlier frame left behind
+    with RecordingWriter.create(tmp_path / "run.zarr", spec) as writer:
+        for arm in ARMS:
+            writer.append(tagger.tag(LineBlock(arm, 0, pixels, flags)))
+        writer.seal(RunCondition.INCOMPLETE, "stopped", {})
+    opened = open_recording(tmp_path / "run.zarr")
+    for arm in ARMS:
+        picture = _arm_overview(opened, arm)
+        assert (picture[1:3] == LOST_COLOUR).all()
+        assert (np.delete(picture, (1, 2), axis=0) == 51).all()
