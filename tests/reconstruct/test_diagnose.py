@@ -16,6 +16,7 @@ from acquire.recon.search import Standing
 from acquire.reconstruct.diagnose import diagnose_recording, diagnosed_range
 from acquire.sim.effects.image import StrayLight
 from acquire.sim.effects.light import CodeErrors
+from acquire.sim.effects.stream import DroppedLines
 from acquire.store import open_recording
 
 LINES = 150
@@ -50,6 +51,14 @@ def test_late_light(told: Told) -> None:
 
 def test_light_later_than_the_search_reaches(told: Told) -> None:
     found = told(CodeErrors(kind="code_errors", late_substeps=60), lines=2500)
+    assert found.standing is Standing.NAMED, found.sentence
+    assert "60 sub-steps late" in found.sentence
+
+
+def test_late_light_despite_lost_lines(told: Told) -> None:
+    """A missing line is no dark line."""
+    lost = DroppedLines(kind="dropped_lines", rate=0.2)
+    found = told(CodeErrors(kind="code_errors", late_substeps=60), lost, lines=2500)
     assert found.standing is Standing.NAMED, found.sentence
     assert "60 sub-steps late" in found.sentence
 
