@@ -77,6 +77,19 @@ def recording(tmp_path: Path) -> Path:
     return write(tmp_path / "one.zarr")
 
 
+def test_why_lines_are_in_doubt_is_told(cli: Cli, recording: Path, tmp_path: Path) -> None:
+    doubts = {"tag_mismatches": 2, "incomplete_a": 100, "unconfirmed_b": 7, "missed_trigger_b": 1}
+    with RecordingWriter.create(tmp_path / "two.zarr", spec()) as writer:
+        for arm in ARMS:
+            writer.append(block(arm, range(0)))
+        writer.seal(RunCondition.TAINTED, "stopped", {"tainted_by": doubts})
+    assert (
+        "tainted by tag mismatches: 2, arm a: 100 lines that arrived damaged, "
+        "arm b: 7 lines that no tag of the trigger confirmed, missed trigger b: 1"
+    ) in " ".join(cli("info", tmp_path / "two.zarr").out.split())
+    assert "tainted by" not in cli("info", recording).out
+
+
 def test_ls(cli: Cli, recording: Path) -> None:
     (recording.parent / "broken.zarr").mkdir()
     (recording.parent / "note.txt").write_text("x")
