@@ -195,8 +195,9 @@ class Client:
                 )
             if time.monotonic() >= deadline:
                 staying = status.state is State.ARMED and State.IDLE in states
+                why = f": {status.waiting}" if status.waiting else ""
                 raise StateError(
-                    f"the daemon is still {status.state} after {timeout_s:g} s of waiting for {wanted}",
+                    f"the daemon is still {status.state} after {timeout_s:g} s of waiting for {wanted}{why}",
                     hint="acquire disarm, or wait for sealed: a recording's end leaves the instrument armed"
                     if staying
                     else "",

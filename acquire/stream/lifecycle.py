@@ -7,7 +7,7 @@
        ▲ REFUSED │      │ OVERDUE          │  ▲  │ DIED         ▲
        └─────────┘      ▼         KILLED   │  │  ▼              │ END, FAULT
                     cancelled     DISK_END ▼  │ lost            │
-                                  replaced, paused ─────────────┘ (paused only)
+                                  replaced, paused ─────────────┘ (paused only; also OVER)
 
 It has no thread and no clock, and sends no messages: times are passed in, and messages for the recorder are
 returned. An event that cannot happen, or a command that makes no sense, has no row.
@@ -80,6 +80,8 @@ class Event(StrEnum):
     """The recorder died, and has no successor."""
     DISK_END = "ended by the disk"
     """The recorder sealed what it had, and continues as soon as the disk allows."""
+    OVER = "over"
+    """The line at which the recording was to end came before the disk allowed a further segment."""
     SEALED = "sealed"
     FAULT = "fault"
     """The capture has failed, or is closed: a recording that has not begun is cancelled."""
@@ -121,6 +123,7 @@ TABLE: dict[tuple[Stage, Event], Stage] = {
     (Stage.PAUSED, Event.REFUSED): Stage.PAUSED,
     (Stage.PAUSED, Event.KILLED): Stage.PAUSED,
     (Stage.PAUSED, Event.DIED): Stage.SEALED,
+    (Stage.PAUSED, Event.OVER): Stage.SEALED,
     (Stage.PAUSED, Event.FAULT): Stage.SEALED,
     # A further segment that was cancelled may have begun, or been refused, before the recorder heard of it.
     (Stage.SEALED, Event.BEGIN): Stage.ASKED,
@@ -300,6 +303,19 @@ class Lifecycle:
             return None
         self._begin = once_more(self._begin)
         return self._begin
+
+    def on_line(self, line: int) -> bool:
+        """Note that the lines have come to ``line``. Return whether that ended a recording that had paused.
+
+        An attempt that is under way is awaited: it may have begun before the end.
+        """
+        end_line = None if self._begin is None else self._begin.end_line
+        is_paused = self.stage is Stage.PAUSED and self.resumption.is_waiting
+        if not is_paused or end_line is None or line < end_line or self._cut_short is None:
+            return False
+        passed = f"its end, line {end_line}, passed before a further segment could begin"
+        self._cut_short = replace(self._cut_short, end_reason=f"{self._cut_short.end_reason}; {passed}")
+        return self._close_pause(self._go(Event.OVER))
 
     def mark_unsealed(self, why: str, committed_lines: int) -> None:
         """Note that every process has ended: a recording that is not sealed now never will be."""

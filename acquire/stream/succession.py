@@ -85,6 +85,11 @@ class Resumption:
         wait_s = 2.0 ** (self._failures - 2) if self._failures > 1 else 0.0
         self._due_s = now_s + min(wait_s, _LONGEST_WAIT_S)
 
+    @property
+    def is_waiting(self) -> bool:
+        """Whether the next attempt has its time, and none is under way."""
+        return self._due_s is not None
+
     def is_due(self, now_s: float) -> bool:
         """Return whether the next segment is to be tried now; True once per attempt."""
         if self._due_s is None or now_s < self._due_s:

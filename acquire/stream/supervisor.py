@@ -224,8 +224,10 @@ class Supervisor:
                 for name, worker in self._workers.items():
                     self._read_messages(name, worker)
                     worker.flush()
-                # A recording that the disk ended continues in a further segment.
+                # A recording that the disk ended continues in a further segment, unless its end has come.
                 with self._news:
+                    if self.life.on_line(max(self._counters[arm]["next_line"] for arm in ARMS)):
+                        self._news.notify_all()
                     following = self.life.due(time.monotonic())
                 if following is not None:
                     self._workers[RECORDER].post(following)

@@ -83,7 +83,8 @@ def test_the_blur_is_measured_last_and_earlier_results_are_kept(tmp_path: Path) 
 def test_repeatedly_missing_lines_are_reported_with_the_ends_of_the_recordings(tmp_path: Path) -> None:
     scene = "kind = 'usaf'\n[[effects]]\nkind = 'dropped_lines'\nrate = 0.3\n"
     (tmp_path / "scene.toml").write_text(scene)
-    with contextlib.closing(Daemon(tmp_path, f"simulation.scene='{tmp_path}/scene.toml'")) as daemon:
+    settings = SETTINGS[0], f"simulation.scene='{tmp_path}/scene.toml'"
+    with contextlib.closing(Daemon(tmp_path, *settings)) as daemon:
         words = ("calibrate", "all", "--yes", "--lines", 1024, "--only", "dark")
         refused = daemon(*words, "--out", tmp_path / "cal.zarr")
         with daemon.client() as client:

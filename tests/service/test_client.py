@@ -24,7 +24,7 @@ def test_the_example_arms_records_marks_cuts_and_reconstructs(
     )
     monkeypatch.chdir(tmp_path)
     names: dict[str, object] = {}
-    with contextlib.closing(Daemon(tmp_path, "stream.ring_slots=64")) as daemon:
+    with contextlib.closing(Daemon(tmp_path)) as daemon:
         monkeypatch.setattr("acquire.client.core.default_socket", lambda: daemon.socket)
         exec(example.replace("lines=200", "lines=40"), names)
     assert names["video"].shape[1:] == (8, 8)  # type: ignore[attr-defined]

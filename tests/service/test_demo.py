@@ -23,7 +23,7 @@ def demo(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, Any]
     out = tmp_path_factory.mktemp("demo") / "run"
     command = ["demo", f"--out={out}", f"--seed={SEED}", f"--lines={LINES}", "--twist-budget=2", "--json"]
     done = subprocess.run(
-        [sys.executable, "-m", "acquire", *command], capture_output=True, text=True, timeout=300, check=False
+        [sys.executable, "-m", "acquire", *command], capture_output=True, text=True, timeout=600, check=False
     )
     assert done.returncode == 0, done.stderr
     return out, json.loads(done.stdout)

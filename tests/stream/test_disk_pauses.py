@@ -135,6 +135,26 @@ def test_after_a_longer_pause_the_recording_goes_on_in_a_further_segment(tmp_pat
         check_books(capture, *(part.path for part in parts))
 
 
+def test_a_recording_whose_end_passes_during_the_pause_has_ended(tmp_path: Path) -> None:
+    """No further segment can begin: it says so, and does not wait for one."""
+    path, lines = tmp_path / "r.zarr", (SHORT_RING + 100) * 64
+    disk = PausingDisk(tmp_path / "gate", "pages")
+    with recording(path, disk, lines, ring_slots=SHORT_RING, goes_on=True) as capture:
+        disk.gate.touch()
+        until(lambda: overflow(capture), "full rings")
+        end_line = (capture.poll().first_line or 0) + lines
+        until(lambda: capture.poll().lines["a"]["delivered"] > end_line + 64 * SHORT_RING, "later lines")
+        disk.gate.unlink()
+        seen = until_done(capture)
+        assert seen.condition == "INTERRUPTED"
+        passed = f"its end, line {end_line}, passed before a further segment could begin"
+        assert re.fullmatch(f"too slow to write: .*; {passed}", str(seen.end_reason))
+        assert (seen.waiting, seen.recording) == ("", False)
+        assert check_whole(path).lines < lines
+        assert [left.name for left in tmp_path.glob("*.zarr")] == ["r.zarr"]
+        check_books(capture, path)
+
+
 def check_records(capture: Capture) -> None:
     """It does not seem to end."""
     seen = capture.poll()

@@ -51,6 +51,7 @@ paused began recording
 paused refused paused
 paused killed paused
 paused died sealed
+paused over sealed
 paused fault sealed
 sealed start asked
 sealed stop sealed
@@ -81,6 +82,8 @@ WAYS = {
 }
 ROWS = {"a": 900, "b": 890}
 SEALED = Sealed(RunCondition.GOOD, "line budget reached", {})
+LINES = 5000
+END_LINE = 500 + LINES
 CUT_SHORT = Sealed(RunCondition.INTERRUPTED, "too slow to write", {}, end_line=1400)
 
 
@@ -110,13 +113,14 @@ class Bench:
             Event.DISK_END: lambda: life.on_sealed(CUT_SHORT, ROWS, 850, 10.0),
             Event.SEALED: lambda: life.on_sealed(SEALED, ROWS, 850, 10.0),
             Event.FAULT: life.on_fault,
+            Event.OVER: lambda: life.on_line(END_LINE),
         }
         return ways[event]()
 
 
 @pytest.mark.parametrize(("stage", "event"), [*itertools.product(Stage, Event)])
 def test_pair(stage: Stage, event: Event, tmp_path: Path) -> None:
-    bench = Bench(tmp_path, stage)
+    bench = Bench(tmp_path, stage, LINES)
     before = (bench.life.began, bench.life.sealed, bench.life.path, bench.life.orphans)
     if (stage, event) in DRAWN:
         bench.happen(event)
@@ -126,8 +130,11 @@ def test_pair(stage: Stage, event: Event, tmp_path: Path) -> None:
             assert bench.life.sealed is None
         assert (bench.life.sealed is not None) == (bench.life.stage is Stage.SEALED)
         return
-    with pytest.raises(StateError, match=MEANINGS[stage]):
-        bench.happen(event)
+    if event is Event.OVER:  # lines come at every stage
+        assert bench.happen(event) is False
+    else:
+        with pytest.raises(StateError, match=MEANINGS[stage]):
+            bench.happen(event)
     assert bench.life.stage is stage
     assert (bench.life.began, bench.life.sealed, bench.life.path, bench.life.orphans) == before
 
@@ -226,6 +233,28 @@ def test_a_budget_stays_through_segments_and_can_be_prolonged_between_them(tmp_p
     successor = one.happen(Event.KILLED)
     assert isinstance(successor, Begin)
     assert (successor.window.at, successor.window.post_lines) == (500 + 850, 5000 - 850)
+
+
+def test_a_pause_ends_with_the_recording_s_end(tmp_path: Path) -> None:
+    """Once the end has passed, every further segment would be refused, for ever."""
+    bench = Bench(tmp_path, Stage.PAUSED, LINES)
+    assert not bench.life.on_line(END_LINE - 1)
+    assert bench.life.due(10.0) is not None
+    assert not bench.life.on_line(END_LINE), "an attempt is under way, and may have begun before the end"
+    bench.happen(Event.REFUSED)
+    assert bench.life.on_line(END_LINE)
+    assert bench.life.sealed is not None
+    assert bench.life.sealed.condition is RunCondition.INTERRUPTED
+    assert bench.life.sealed.end_reason.startswith("too slow to write; its end, line 5500, passed")
+    assert (bench.life.resumption.why, bench.life.due(1e9)) == ("", None)
+
+
+def test_a_pause_lasts_when_the_end_is_put_off_or_unknown(tmp_path: Path) -> None:
+    bench = Bench(tmp_path, Stage.PAUSED, LINES)
+    bench.life.extend(END_LINE + 100)
+    assert not bench.life.on_line(END_LINE)
+    assert bench.life.on_line(END_LINE + 100)
+    assert not Bench(tmp_path / "open", Stage.PAUSED).life.on_line(10**9)
 
 
 def test_lines_that_a_recording_holds_are_remembered_and_a_pause_holds_none(tmp_path: Path) -> None:
