@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from acquire.cli.output import quantity
-from acquire.flags import ARMS
+from acquire.store import taint_words
 from acquire.text import shortened
 
 if TYPE_CHECKING:
@@ -91,7 +91,7 @@ def recording_facts(facts: dict[str, Any]) -> dict[str, Any]:
         "disk": _disk(facts["disk"]),
         "at risk": _at_risk(facts["durability"]),
         "lost lines": ", ".join(f"{arm} {count}" for arm, count in facts["lost_lines"].items()),
-        "tainted by": _some(_taints(facts["ledger"].get("tainted_by", {}))),
+        "tainted by": _some(taint_words(facts["ledger"].get("tainted_by", {}))),
         "in doubt": _some(suspect),
         "calibration": calibration,
         "simulated": "yes" if facts["simulated"] else "no",
@@ -104,21 +104,6 @@ def _some(items: Sequence[str]) -> str | None:
     """Join up to `LISTED` items and count the others; None if there are none."""
     more = [f"and {len(items) - LISTED} more"] if len(items) > LISTED else []
     return ", ".join([*items[:LISTED], *more]) or None
-
-
-def _taints(counts: dict[str, int]) -> list[str]:
-    """The reasons to doubt stored lines, in words: those of an arm, and names of the trigger's counts."""
-    words = {
-        "incomplete": "lines that arrived damaged",
-        "unconfirmed": "lines that no tag of the trigger confirmed",
-        "code_contradicted": "lines that contradict the code",
-    }
-    reasons = []
-    for name, count in counts.items():
-        kind, _, arm = name.rpartition("_")
-        known = arm in ARMS and kind in words
-        reasons.append(f"arm {arm}: {count} {words[kind]}" if known else f"{name.replace('_', ' ')}: {count}")
-    return reasons
 
 
 def _imported(found: dict[str, Any] | None) -> str | None:

@@ -38,7 +38,7 @@ if TYPE_CHECKING:
     from acquire.store.retention import Hold, hold
     from acquire.store.shape import Codec
     from acquire.store.spec import RecordingSpec, RunCondition
-    from acquire.store.suspect import Suspect, suspect_lines
+    from acquire.store.suspect import Suspect, suspect_lines, taint_words
     from acquire.store.table_reader import Event, Gap
     from acquire.store.terms import Continuation, Retention
     from acquire.store.verification import Verification, verify
@@ -83,6 +83,7 @@ __all__ = [
     "open_video",
     "recover",
     "suspect_lines",
+    "taint_words",
     "verify",
     "write_video",
 ]
@@ -123,6 +124,7 @@ _HOMES = {
     "open_video": "video",
     "recover": "recovery",
     "suspect_lines": "suspect",
+    "taint_words": "suspect",
     "verify": "verification",
     "write_video": "video",
 }

@@ -1,4 +1,7 @@
-"""Recorded lines that do not follow the light's code, according to the checks during the recording.
+"""Recorded lines that are in doubt, and why.
+
+The checks during the recording find lines that do not follow the light's code (`suspect_lines`); the ledger
+counts every reason to doubt stored lines (`taint_words`).
 
 A check takes some tenths of a second of lines, and its verdict comes after them: lines written before it are
 not flagged. So the recording's events state from which line on the code is in doubt, and from which line on
@@ -21,6 +24,8 @@ from typing import TYPE_CHECKING, Any
 from acquire.flags import ARMS
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
     from acquire.store.outline import Outline
 
 DOUBTFUL = {arm: f"code_doubtful_{arm}" for arm in ARMS}
@@ -28,6 +33,12 @@ DOUBTFUL = {arm: f"code_doubtful_{arm}" for arm in ARMS}
 VERIFIED = {arm: f"code_verified_{arm}" for arm in ARMS}
 """Arm → kind of the event from whose line on they follow the code."""
 CODE_EVENTS = frozenset((*DOUBTFUL.values(), *VERIFIED.values()))
+
+_TAINTS = {
+    "incomplete": "lines that arrived damaged",
+    "unconfirmed": "lines that no tag of the trigger confirmed",
+    "code_contradicted": "lines that contradict the code",
+}
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,3 +73,15 @@ def suspect_lines(recording: Outline) -> tuple[Suspect, ...]:
         if doubt is not None:
             found.append(Suspect(arm, doubt[0], end - doubt[0], doubt[1]))
     return tuple(one for one in found if one.count > 0)
+
+
+def taint_words(counts: Mapping[str, int]) -> list[str]:
+    """Return the ledger's ``tainted_by`` in words: reasons of an arm, and names of the trigger's counts."""
+    reasons = []
+    for name, count in counts.items():
+        kind, _, arm = name.rpartition("_")
+        if arm in ARMS and kind in _TAINTS:
+            reasons.append(f"arm {arm}: {count} {_TAINTS[kind]}")
+        else:
+            reasons.append(f"{name.replace('_', ' ')}: {count}")
+    return reasons

@@ -17,7 +17,7 @@ from PIL import Image
 
 from acquire.errors import AcquireError, PlaceError, UsageError
 from acquire.flags import ARMS, NO_IMAGE
-from acquire.store import Recording, format_of, hold, open_recording, open_video
+from acquire.store import Recording, format_of, hold, open_recording, open_video, taint_words
 from acquire.store.layout import DAMAGE
 from acquire.store.shortfall import first_shortfall, missing_segments
 from acquire.text import shortened
@@ -217,6 +217,7 @@ def _facts(path: Path, opened: Recording) -> RecordingFacts:
         bytes=info["bytes"],
         start_ns=info["start_ns"],
         lost_lines=info["lost_lines"],
+        tainted_by=taint_words(info["ledger"].get("tainted_by", {})),
         events=info["events"],
         held=bool(info["holds"]) or any((path / ".holds").glob("*")),
         uploaded=(opened.attrs.get("config", {}).get("recording") or {}).get("upload_to"),

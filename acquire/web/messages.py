@@ -38,6 +38,7 @@ class RecordingFacts(Message):
     bytes: int = 0
     start_ns: int | None = None
     lost_lines: dict[str, int] = Field(default={})
+    tainted_by: list[Text] = Field(default=[], description="the reasons to doubt stored lines")
     events: int = 0
     held: bool = Field(default=False, description="some of its lines are protected from retention")
     uploaded: Text | None = Field(default=None, description="URL to which it is copied")

@@ -1,4 +1,4 @@
-"""The overview of a recording: its brightest values, without lines that have no image."""
+"""Recordings as the page lists and shows them."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from acquire.lines import ARMS, LineBlock, LineFlag
 from acquire.store import RecordingSpec, RecordingWriter, RunCondition, open_recording
 from acquire.stream.tagger import Tagger
 from acquire.trigger.base import TriggerRun
-from acquire.web.archive import LINES_PER_ROW, LOST_COLOUR, PICTURE_ROWS, _arm_overview
+from acquire.web.archive import LINES_PER_ROW, LOST_COLOUR, PICTURE_ROWS, Archive, _arm_overview
 
 M, LINES, WHITE = 6, LINES_PER_ROW * PICTURE_ROWS, 4095
 
 
-def test_damaged_and_missing_lines_are_shown_as_lost(tmp_path: Path) -> None:
+def test_damaged_and_missing_lines_are_shown_as_lost_and_told(tmp_path: Path) -> None:
     code, clock = PrbsCode(15, 77), ClockFit(90_000_000, 1_700_000_000_000_000_000, 100)
     camera = {"white_dn": WHITE, "black_level_dn": 0.0, "responsivity_dn": 1.0}
     spec = RecordingSpec(
@@ -34,9 +34,11 @@ def test_damaged_and_missing_lines_are_shown_as_lost(tmp_path: Path) -> None:
     with RecordingWriter.create(tmp_path / "run.zarr", spec) as writer:
         for arm in ARMS:
             writer.append(tagger.tag(LineBlock(arm, 0, pixels, flags)))
-        writer.seal(RunCondition.INCOMPLETE, "stopped", {})
+        writer.seal(RunCondition.TAINTED, "stopped", {"tainted_by": {"incomplete_b": 7, "tag_mismatches": 2}})
     opened = open_recording(tmp_path / "run.zarr")
     for arm in ARMS:
         picture = _arm_overview(opened, arm)
         assert (picture[1:3] == LOST_COLOUR).all()
         assert (np.delete(picture, (1, 2), axis=0) == 51).all()
+    (listed,) = Archive(tmp_path).recordings()
+    assert listed.tainted_by == ["arm b: 7 lines that arrived damaged", "tag mismatches: 2"]

@@ -39,6 +39,7 @@ export function duration(seconds) {
   if (!(seconds < 1e12)) return "–";
   for (const [name, length] of [["days", 86400], ["h", 3600], ["min", 60]])
     if (seconds >= 2 * length) return `${Number((seconds / length).toPrecision(3))}\u202f${name}`;
+  if (seconds > 0 && seconds < 0.1) return quantity(seconds, "s");
   return `${seconds < 10 ? seconds.toFixed(1) : Math.round(seconds)}\u202fs`;
 }
 
