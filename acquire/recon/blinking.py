@@ -65,7 +65,7 @@ TRIAL_ROUNDS = 2
 """Number of rounds after which superfluous patterns are recognised."""
 LONGEST_TRIAL = 2
 """Largest number of times that as many rounds are made without them."""
-WEIGHT_PER_NOISE = float(__import__("os").environ.get("WPN", "0.17"))
+WEIGHT_PER_NOISE = 0.17
 """λ of the first round relative to the lines' noise."""
 NOISE_SHARE = 0.7
 """Share of noise in the first look's prediction error, for cameras whose noise is unknown."""
