@@ -299,14 +299,18 @@ class Ring:
     @property
     def released_lines(self) -> int:
         """Lines in the blocks that the reader has released and not taken back."""
+        # From the oldest block that waits: in a full ring, the slot of the one before it is overwritten.
         tail = self._control[_TAIL]
-        return int(self._header(tail - 1)[_TOTAL]) if tail else 0
+        if self._control[_HEAD] == tail:
+            return self.committed_lines
+        header = self._header(tail)
+        return int(header[_TOTAL] - header[_COUNT])
 
     @property
     def released_line(self) -> int:
-        """The line after the last that the reader has released; 0 before the first."""
+        """The line after the last that the reader has released, or lost since; 0 before the first."""
         tail = self._control[_TAIL]
-        return self._end_line(tail - 1) if tail else 0
+        return self.newest_line if self._control[_HEAD] == tail else int(self._header(tail)[_FIRST_LINE])
 
     @property
     def oldest_block(self) -> RingBlock | None:

@@ -182,6 +182,8 @@ class RingMachine(RuleBasedStateMachine):
         )
         newest = sum(self.blocks[-1][:2]) if self.blocks else 0
         assert self.ring.newest_line == newest
+        assert self.ring.released_lines == sum(lines for _, lines, _ in self.blocks[: self.tail])
+        assert self.ring.released_line == (self.blocks[self.tail][0] if waiting else newest)
         held = self.blocks[min(self.tail, self.oldest) :]
         assert self.ring.history_line == (held[0][0] if held else newest)
         for observer, seen in zip(self.observers, self.watching, strict=True):
@@ -263,6 +265,7 @@ def test_history_is_taken_back_from_the_line_that_is_asked_for() -> None:
         assert ring.claim() is not None
         ring.commit(10 * block, 10)
     assert ring.claim() is None
+    assert ring.released_line == 280  # though what was released last has been overwritten
     del taken
     ring.close()
 
