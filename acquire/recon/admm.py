@@ -182,7 +182,10 @@ class Admm:
                 return
             lifted = self._operator.adjoint(direction)
             image = self._operator.forward(lifted) + rho * direction
-            length = energy / dot(direction, image)
+            curvature = dot(direction, image)
+            if not curvature > 0:  # the direction is so short that its square vanishes
+                return
+            length = energy / curvature
             self._w += length * direction
             self._lifted += length * lifted
             residual -= length * image

@@ -57,6 +57,8 @@ def fit_brightness(
             rows = seen[used].astype(np.float64)
             normal += rows.T @ rows
             right += rows.T @ (problem.samples[arm, line][used] * problem.norm)
+    if not normal.any():
+        return np.ones(frames)  # a dark video explains nothing, however bright
     flat = basis @ np.ones(frames)
     damping = RIDGE * np.trace(normal) / cosines
     change = np.linalg.solve(normal + damping * np.eye(cosines), right - normal @ flat)

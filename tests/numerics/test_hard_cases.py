@@ -143,6 +143,14 @@ def test_one_line_and_one_stage(geometry: Geometry, solver: str) -> None:
         assert any("fewer lines than stages" in warning for warning in result.warnings)
 
 
+@pytest.mark.parametrize("geometry", [Geometry(1, 2, 1), Geometry(5, 5, 15)])
+def test_lines_below_the_black_level_give_a_warning(geometry: Geometry) -> None:
+    """A dark video explains nothing, whatever its brightness."""
+    code = prbs(64, 7, 0, geometry.span)
+    below = replace(segment(np.zeros(geometry.lines_shape), code, geometry), black_level_dn=100.0)
+    assert any("misses the lines" in warning for warning in solve(below, merges=(1, 1)).warnings)
+
+
 @pytest.mark.parametrize("merges", [(3, 1000), (5, 1), (7, 13), (48, 1), (1, GEOMETRY.span)])
 def test_merges_that_divide_nothing(merges: tuple[int, int]) -> None:
     result = solve(segment(), merges=merges, iterations=10)
