@@ -52,6 +52,12 @@ def test_malformed_files_are_refused(
     assert len(str(caught.value)) < SENTENCE_CHARACTERS
 
 
+@pytest.mark.parametrize("key", ["control.socket", "recording.directory"])
+def test_a_path_with_a_null_character_is_refused(key: str) -> None:
+    with pytest.raises(ConfigError, match=f"{key} = .*: a path cannot contain a null character"):
+        load_rig("rig-demo", parse_settings([f'{key}="a\\u0000b"']))
+
+
 def test_special_files_are_not_read(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "pipe.toml")
     for odd in (tmp_path / "pipe.toml", Path("/dev/zero"), Path("/dev/null")):

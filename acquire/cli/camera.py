@@ -116,7 +116,7 @@ def _check_out(path: Path) -> None:
         raise UsageError(
             f"a snapshot cannot be saved as {path.name}: its suffix is not a known format",
             possible=".png, .npy",
-            hint=f"--out {path.with_suffix('.png')}",
+            hint=f"--out {path.parent / (path.stem or 'snapshot')}.png",
         )
     if path.exists():
         raise UsageError(

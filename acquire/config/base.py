@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated, Any
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
 
 MOST_CHARACTERS = 4096
 """Longest text in a file, such as a path, a URL or a name."""
@@ -40,7 +40,13 @@ def _tuples(items: list[Any]) -> tuple[Any, ...]:
     return tuple(_tuples(item) if isinstance(item, list) else item for item in items)
 
 
-FilePath = Annotated[Path, Field(strict=False)]
+def _without_null(path: Path) -> Path:
+    if "\0" in str(path):
+        raise ValueError("a path cannot contain a null character")
+    return path
+
+
+FilePath = Annotated[Path, Field(strict=False), AfterValidator(_without_null)]
 """A path, written as text in files."""
 Seconds = Annotated[float, Field(ge=0, le=MOST_SECONDS)]
 """A duration of plausible length."""

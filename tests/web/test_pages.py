@@ -156,6 +156,8 @@ def paper(directory: Path) -> Path:
     )
     still = PaperFigure("fig6", "Resolution", "At rest.", (), rows[:1], {"static": 1.5})
     drawn = [paper_page.draw(each, directory, BUSY) for each in (still, figure)]
+    # The command writes the page after every figure, at first without a video.
+    paper_page.write_page(drawn[:1], Studio(directory), "acquire paper fig6 fig9", WHEN)
     return paper_page.write_page(drawn, Studio(directory), "acquire paper fig6 fig9", WHEN)
 
 
