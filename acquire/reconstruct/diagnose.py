@@ -101,8 +101,10 @@ def _sights(segment: Segment) -> dict[str, Sight]:
     black = np.broadcast_to(np.asarray(segment.black_level_dn, float).reshape(-1), (2,))
     sights = {}
     for name, lines, mask, level in zip(ARMS, segment.lines, segment.mask, black, strict=True):
+        light = np.maximum(lines - level, 0.0)  # of lost samples none, of saturated ones the most
         dn = np.where(mask, lines - level, 0.0)
         per_line, per_column = mask.sum(1), np.maximum(mask.sum(0), 1)
         energy = np.where(per_line > 0, dn.sum(1) / np.maximum(per_line, 1), np.nan)
-        sights[name] = Sight(energy, dn.sum(0) / per_column)
+        saturated = float(light[~mask].sum() / max(light.sum(), 1e-12))
+        sights[name] = Sight(energy, dn.sum(0) / per_column, saturated)
     return sights

@@ -108,7 +108,8 @@ class Watcher:
             first_line = max(ring.newest_line for ring in self._rings.values())
             self._next_s = now_s + _CHECK_EVERY_S
             self._intakes = {
-                arm: Intake(first_line, self._plan.lines, self._plan.black_dn[arm]) for arm in ARMS
+                arm: Intake(first_line, self._plan.lines, self._plan.black_dn[arm], self._plan.judge.white_dn)
+                for arm in ARMS
             }
         for arm, observer in self._observers.items():
             self._look(arm, observer)
@@ -196,12 +197,13 @@ class Intake:
     or a block was overwritten while it was read; the check cannot be made.
     """
 
-    def __init__(self, first_line: int, lines: int, black_dn: float) -> None:
+    def __init__(self, first_line: int, lines: int, black_dn: float, white_dn: int) -> None:
         self.first_line = first_line
         self.broken = False
         self._energy = np.full(lines, np.nan)
         self._count = self._seen = 0
-        self._black_dn = black_dn
+        self._black_dn, self._white_dn = black_dn, white_dn
+        self._saturated = self._columns = 0
         self._profile: list[NDArray[np.float64]] = []
         self._profile_step = max(1, lines // _MOST_PROFILE_LINES)
 
@@ -223,7 +225,10 @@ class Intake:
             pixels = pixels[usable]
         # Evenly spaced columns and lines: the mean of all would take a processor at 100 kHz, and the code
         # shows in any part of the line.
-        energy = pixels[:, :: -(-pixels.shape[1] // _MOST_COLUMNS)].mean(axis=1)
+        sampled = pixels[:, :: -(-pixels.shape[1] // _MOST_COLUMNS)]
+        energy = sampled.mean(axis=1)
+        self._saturated += int(np.count_nonzero(sampled >= self._white_dn))
+        self._columns = sampled.shape[1]
         self._energy[self._count + np.flatnonzero(usable)] = energy
         self._count += len(usable)
         self._seen += len(energy)
@@ -233,5 +238,7 @@ class Intake:
 
     def sight(self) -> Sight:
         """Return the means of the lines and of the pixels, above the black level."""
-        profile = np.mean(self._profile, axis=0)
-        return Sight(self._energy - self._black_dn, profile - self._black_dn)
+        energy, profile = self._energy - self._black_dn, np.mean(self._profile, axis=0) - self._black_dn
+        light = float(np.nansum(energy)) * self._columns
+        saturated = self._saturated * (self._white_dn - self._black_dn)
+        return Sight(energy, profile, saturated / light if light > 0 else 0.0)

@@ -102,6 +102,36 @@ def test_an_arm_that_slipped_by_lines_is_told_from_the_other(scene: str, slip: i
     )
 
 
+def overexposed(gain: float, late: int) -> tuple[dict[str, Finding], dict[str, float]]:
+    """Verdicts on light that is ``gain`` times too bright, and its share in saturated samples."""
+    lines, stages, substeps, white, code = recorded("scene-leds")
+    clipped = {arm: np.minimum(gain * pixels, white) for arm, pixels in lines.items()}
+    shares = {
+        arm: float((pixels * (pixels >= white)).sum() / pixels.sum()) for arm, pixels in clipped.items()
+    }
+    seen = {
+        arm: Sight(pixels.mean(axis=1), pixels.mean(axis=0), shares[arm]) for arm, pixels in clipped.items()
+    }
+    return Judge(stages, substeps, Altered(code, late=late), white, {}).look(FIRST, seen), shares
+
+
+@pytest.mark.parametrize("late", [0, -40])
+def test_light_that_saturates_the_camera_is_no_evidence_against_the_code(late: int) -> None:
+    for gain in (4.0, 20.0, 100.0, 1e4):
+        found, shares = overexposed(gain, late)
+        assert max(shares.values()) > 0.5
+        assert {finding.verdict for finding in found.values()} <= {Verdict.UNKNOWN, Verdict.VERIFIED}
+        assert not (late and Verdict.VERIFIED in {finding.verdict for finding in found.values()})
+
+
+@pytest.mark.parametrize("late", [0, -40])
+def test_light_that_saturates_some_samples_is_judged(late: int) -> None:
+    found, shares = overexposed(2.5, late)
+    assert min(shares.values()) > 0.02
+    for finding in found.values():
+        assert (finding.verdict, finding.shift) == (Verdict.SHIFTED if late else Verdict.VERIFIED, -late)
+
+
 def test_a_known_registration_is_no_shift() -> None:
     lines, stages, substeps, white, code = recorded("scene-usaf")
     judge = Judge(stages, substeps, Altered(code, late=-2), white, {"a": 2, "b": 2})

@@ -172,6 +172,17 @@ def test_a_check_with_hardly_any_line_begins_again(beds: list[Bed]) -> None:
     assert bed.verdicts() == [Verdict.VERIFIED, Verdict.VERIFIED]
 
 
+def test_lines_of_a_saturated_camera_prove_nothing_against_the_code(beds: list[Bed]) -> None:
+    bed = Bed(late=-2)
+    beds.append(bed)
+    bed.lines = {"a": bed.lines["a"], "b": np.minimum(30.0 * bed.lines["b"], 4095).astype(np.uint16)}
+    bed.turn()
+    bed.pass_by(17)
+    assert bed.counters["checks_b"] == 1
+    assert bed.verdicts() == [Verdict.UNKNOWN, Verdict.UNKNOWN]
+    assert bed.post.said == []
+
+
 def test_a_crossing_is_told_with_its_line(beds: list[Bed]) -> None:
     bed = Bed(ThresholdPlan("b", 3000.0, 100.0, rising=True, average_lines=64))
     beds.append(bed)
