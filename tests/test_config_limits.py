@@ -58,6 +58,16 @@ def test_a_path_with_a_null_character_is_refused(key: str) -> None:
         load_rig("rig-demo", parse_settings([f'{key}="a\\u0000b"']))
 
 
+def test_more_tags_than_the_host_can_read_are_refused() -> None:
+    settings = {"trigger.substep_ticks": 900, "trigger.tag_every_lines": 3}
+    fewest = r"cannot be 3 at 33333.3 lines/s; possible: 4 or more, since the host reads up to 10000 tags/s"
+    with pytest.raises(ConfigError, match=fewest):
+        load_rig("rig-demo", settings)
+    assert load_rig("rig-demo", settings | {"trigger.tag_every_lines": 4}).trigger.tag_every_lines == 4
+    with pytest.raises(ConfigError, match=r"cannot be 4 at 66666\.7 lines/s"):
+        load_rig("rig-demo", settings | {"trigger.tag_every_lines": 4, "simulation.speed": 2.0})
+
+
 def test_special_files_are_not_read(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "pipe.toml")
     for odd in (tmp_path / "pipe.toml", Path("/dev/zero"), Path("/dev/null")):

@@ -32,6 +32,8 @@ WHOLE_STEPS = ("VT-4K5C-H100",)
 """Camera models that are known to have no intra-line charge transfer."""
 MAX_RING_BYTES = 4 * 2**30
 """Largest ring of one arm."""
+MOST_TAGS_PER_S = 10_000
+"""A free processor reads three times as many. To a host that lags behind, the trigger seems to be late."""
 
 
 class GeometryConfig(FrozenModel):
@@ -207,6 +209,17 @@ class RigConfig(FrozenModel):
             raise ValueError(
                 f"trigger.tag_every_lines cannot be {self.trigger.tag_every_lines}; possible: 1 to "
                 f"{lines // 3}, a third of what a ring holds (stream.{self._ring_keys})"
+            )
+        return self
+
+    @model_validator(mode="after")
+    def _tags_can_be_read(self) -> RigConfig:
+        passing_hz = self.line_rate_hz * self.simulation.speed
+        fewest = math.ceil(passing_hz / MOST_TAGS_PER_S)
+        if self.trigger.tag_every_lines < fewest:
+            raise ValueError(
+                f"trigger.tag_every_lines cannot be {self.trigger.tag_every_lines} at {passing_hz:g} "
+                f"lines/s; possible: {fewest} or more, since the host reads up to {MOST_TAGS_PER_S} tags/s"
             )
         return self
 
