@@ -20,6 +20,7 @@ from acquire.stream.messages import Began, Cancel, Checked, End, Extend, Interru
 from acquire.stream.stalls import Excess, Heartbeat
 from acquire.stream.succession import Succession, replacement_note
 from acquire.stream.tagger import tag_rows
+from acquire.trigger.base import WATCHDOG
 
 if TYPE_CHECKING:
     from acquire.processes.shared import Counters
@@ -253,6 +254,12 @@ class Supervisor:
             self._trigger_heard_s = time.monotonic()
         for event in self._trigger.events():
             self.report(Note(event.line, event.kind, f"tick {event.tick}"))
+            if event.kind == WATCHDOG:  # no line comes any more: a recording that began now would be empty
+                self._trigger_lost = True
+                self._fail(
+                    f"trigger: its watchdog ended the run at line {event.line}, "
+                    "since this host had given no sign of life for too long"
+                )
         rows = self._tags.shape.rows
         for at in range(0, len(tags), rows):
             some = tags[at : at + rows]

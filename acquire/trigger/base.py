@@ -83,6 +83,10 @@ class LineTag:
     tick: int
 
 
+WATCHDOG = "watchdog"
+"""Kind of the event that ends a run: the host gave no sign of life for ``trigger.watchdog_s``."""
+
+
 @dataclass(frozen=True, slots=True)
 class TagEvent:
     """Event detected by the trigger during ``line``: ``input``, ``missed_trigger_a`` and so on."""

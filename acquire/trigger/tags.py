@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import deque
 from typing import TYPE_CHECKING, ClassVar
 
-from acquire.trigger.base import LineTag, TagEvent
+from acquire.trigger.base import WATCHDOG, LineTag, TagEvent
 from acquire.trigger.registers import TAG_FIELDS, TIME_BITS, TagFlag
 
 if TYPE_CHECKING:
@@ -24,7 +24,7 @@ EVENTS = {
     TagFlag.MISSED_B: "missed_trigger_b",
     TagFlag.UNEXPECTED_A: "unexpected_strobe_a",
     TagFlag.UNEXPECTED_B: "unexpected_strobe_b",
-    TagFlag.WATCHDOG: "watchdog",
+    TagFlag.WATCHDOG: WATCHDOG,
     TagFlag.CLOCK_LOST: "clock_lost",
     TagFlag.BUDGET: "line_budget",
 }

@@ -39,7 +39,7 @@ from acquire.errors import AcquireError, CameraError, DeviceError, StateError, T
 from acquire.lines import ARMS, LineFlag
 from acquire.store import Recording, RunCondition, open_recording
 from acquire.stream import Begin, Capture, CaptureStatus
-from acquire.trigger.base import TriggerRun
+from acquire.trigger.base import WATCHDOG, TagEvent, TriggerRun
 
 UNCONFIRMED = LineFlag.TIME_ESTIMATED | LineFlag.CODE_UNVERIFIED
 
@@ -427,6 +427,22 @@ def test_a_trigger_that_fails_is_a_fault(tmp_path: Path, error: Exception, fault
     recording, _ = check_rows(tmp_path / "r.zarr")
     assert recording.attrs["run_condition"] == "INTERRUPTED"
     assert recording.attrs["end_reason"] == fault
+
+
+def test_a_run_that_the_trigger_s_watchdog_ended_is_a_fault(tmp_path: Path) -> None:
+    """At once: until the arms' silence is one, recordings could begin, and would be empty."""
+    bench = make_bench()
+    with armed(bench) as capture:
+        record_until(capture, tmp_path / "r.zarr", 1000)
+        bench.trigger.stop()
+        bench.trigger.told = [TagEvent(1234, 5678, WATCHDOG)]
+        until(lambda: capture.poll().fault, "the fault")
+        assert str(capture.poll().fault).startswith("trigger: its watchdog ended the run at line 1234")
+        with pytest.raises(StateError, match="watchdog"):
+            capture.start(Begin(tmp_path / "later.zarr", make_spec()))
+    recording, _ = check_rows(tmp_path / "r.zarr")
+    assert recording.attrs["run_condition"] == "INTERRUPTED"
+    assert "watchdog" in recording.attrs["end_reason"]
 
 
 def test_a_supervisor_that_its_trigger_holds_up_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
