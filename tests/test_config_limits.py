@@ -58,6 +58,16 @@ def test_a_path_with_a_null_character_is_refused(key: str) -> None:
         load_rig("rig-demo", parse_settings([f'{key}="a\\u0000b"']))
 
 
+def test_a_block_that_takes_as_long_as_a_stall_is_refused() -> None:
+    settings = {"trigger.substep_ticks": 90_000, "stream.block_lines": 500, "stream.reopen_s": 0.0}
+    words = (
+        r"cannot be 500: at 333\.333 lines/s such a block takes 1\.5 s; possible: up to 333, half the time"
+    )
+    with pytest.raises(ConfigError, match=words):
+        load_rig("rig-demo", settings | {"stream.stall_s": 2.0})
+    assert load_rig("rig-demo", settings | {"stream.stall_s": 4.0}).stream.block_lines == 500
+
+
 def test_more_tags_than_the_host_can_read_are_refused() -> None:
     settings = {"trigger.substep_ticks": 900, "trigger.tag_every_lines": 3}
     fewest = r"cannot be 3 at 33333.3 lines/s; possible: 4 or more, since the host reads up to 10000 tags/s"

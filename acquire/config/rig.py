@@ -213,6 +213,18 @@ class RigConfig(FrozenModel):
         return self
 
     @model_validator(mode="after")
+    def _blocks_come_before_a_stall(self) -> RigConfig:
+        """A camera delivers whole blocks: until one is full, its arm is silent."""
+        passing_hz, most_s = self.line_rate_hz * self.simulation.speed, self.stall_timeout_s / 2
+        if (block_s := self.stream.block_lines / passing_hz) > most_s:
+            raise ValueError(
+                f"stream.block_lines cannot be {self.stream.block_lines}: at {passing_hz:g} lines/s such a "
+                f"block takes {block_s:.3g} s; possible: up to {math.floor(passing_hz * most_s)}, half the "
+                "time after which an arm counts as stalled (stream.stall_s, stream.reopen_s)"
+            )
+        return self
+
+    @model_validator(mode="after")
     def _tags_can_be_read(self) -> RigConfig:
         passing_hz = self.line_rate_hz * self.simulation.speed
         fewest = math.ceil(passing_hz / MOST_TAGS_PER_S)
@@ -348,6 +360,11 @@ class RigConfig(FrozenModel):
     @property
     def line_period_ticks(self) -> int:
         return self.geometry.substeps * self.trigger.substep_ticks
+
+    @property
+    def stall_timeout_s(self) -> float:
+        """Time without a line after which an arm counts as stalled; until then a camera may be reopened."""
+        return max(self.stream.stall_s, self.stream.reopen_s + 1.0)
 
     @property
     def line_rate_hz(self) -> float:

@@ -169,7 +169,7 @@ def capture_plan(config: RigConfig, rig: Rig, run_id: str) -> CapturePlan:
         watch=watch_plan(config),
         white_dn=config.cameras.a.white_dn,
         openers=rig.openers(),
-        stall_timeout_s=max(config.stream.stall_s, config.stream.reopen_s + 1.0),
+        stall_timeout_s=config.stall_timeout_s,
         reopen_timeout_s=config.stream.reopen_s,
         columns=config.columns,
         realtime=config.stream.realtime,
