@@ -15,7 +15,8 @@ light, gives the verdict::
     inverted     as high, negative                    unknown       too little contrast, or too much light
 
 Light that saturates the camera no longer adds up. If most of it does, other rows than predicted show the
-code, and only its presence at delay 0 is evidence.
+code, and only its presence at delay 0 is evidence. The same holds for a code that repeats while charge
+crosses the sensor: a scene that flickers may look like it at any delay.
 """
 
 from __future__ import annotations
@@ -139,8 +140,12 @@ class Judge:
             arm: self._judge(sights[arm], others[arm], bits, reach - self.registration.get(arm, 0))
             for arm in sights
         }
+        if not any(finding.verdict.doubtful for finding in found.values()):
+            return found
         # Each arm is predicted from the other: it is enough that one of them is saturated.
-        if max(sight.saturated for sight in sights.values()) <= _MOST_SATURATED:
+        saturated = max(sight.saturated for sight in sights.values()) > _MOST_SATURATED
+        # The run has no code before line 0.
+        if not saturated and not _repeats(bits[reach:], span):
             return found
         return {
             arm: finding if finding.verdict is Verdict.VERIFIED else Finding(Verdict.UNKNOWN)
@@ -209,6 +214,11 @@ def _read(peaks: NDArray[np.float64], nominal: int, contrast: float, lines: int)
         return Finding(Verdict.DARK, 0, peak)
     certain = min(contrast, 1.0) * np.sqrt(lines) > _MUST_SHOW
     return Finding(Verdict.WRONG_CODE if certain else Verdict.UNKNOWN, 0, peak)
+
+
+def _repeats(bits: NDArray[np.uint8], within: int) -> bool:
+    """Return whether the code has a period shorter than this number of sub-steps."""
+    return any(np.array_equal(bits[period:], bits[:-period]) for period in range(1, within))
 
 
 def _transform_size(length: int) -> int:

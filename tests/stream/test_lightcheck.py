@@ -124,6 +124,20 @@ def test_light_that_saturates_the_camera_is_no_evidence_against_the_code(late: i
         assert not (late and Verdict.VERIFIED in {finding.verdict for finding in found.values()})
 
 
+@pytest.mark.parametrize("degree", [3, 4, 5])
+def test_a_code_that_repeats_within_the_sensor_is_no_evidence(degree: int) -> None:
+    settings = {"geometry.stages": 16, "geometry.substeps": 3, "code.degree": degree}
+    rig = load_rig("rig-demo", settings)
+    cameras = {arm: rig.cameras.arm(arm) for arm in "ab"}
+    step_s = rig.trigger.substep_ticks / rig.trigger.clock_hz
+    bench, code = Bench(load_scene("scene-leds"), rig.geometry, cameras, step_s), rig.code.build()
+    judge = Judge(16, 3, code, rig.cameras.a.white_dn, {})
+    for first in range(0, 40_000, 8000):
+        lines = {arm: bench.camera(arm, code).read(first, 2500).pixels for arm in "ab"}
+        for finding in judge.look(first, sights(lines)).values():
+            assert not finding.verdict.doubtful
+
+
 @pytest.mark.parametrize("late", [0, -40])
 def test_light_that_saturates_some_samples_is_judged(late: int) -> None:
     found, shares = overexposed(2.5, late)
