@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import threading
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +11,15 @@ import pytest
 from threadpoolctl import threadpool_info
 
 from acquire import cores
-from acquire.cores import idle_cores, limit_blas, usable_cores
+from acquire.cores import (
+    granted_threads,
+    idle_cores,
+    limit_blas,
+    limit_threads,
+    side_by_side,
+    usable_cores,
+)
+from acquire.errors import NumericsError
 
 
 def blas_threads() -> set[int]:
@@ -23,6 +32,27 @@ def test_blas_is_limited_for_a_while() -> None:
         with limit_blas(1):
             assert blas_threads() == {1}
         assert blas_threads() == {2}
+
+
+def test_both_results_come_from_threads_that_have_ended() -> None:
+    before = threading.active_count()
+    meet = threading.Barrier(2, timeout=30)  # each waits for the other: they run at the same time
+    first, second = side_by_side(lambda: (1, meet.wait()), lambda: (2, meet.wait()))
+    assert (first[0], second[0]) == (1, 2)
+    assert threading.active_count() == before
+
+    def fail() -> None:
+        raise NumericsError("not finite")
+
+    for pair in (fail, threading.active_count), (threading.active_count, fail):
+        with pytest.raises(NumericsError, match="not finite"):
+            side_by_side(*pair)
+    assert threading.active_count() == before
+
+
+def test_loops_get_no_more_threads_than_they_are_granted() -> None:
+    with limit_threads(1):
+        assert granted_threads() == 1
 
 
 @pytest.mark.parametrize(

@@ -23,7 +23,7 @@ import numpy as np
 
 from acquire.client import Client
 from acquire.config import RigConfig
-from acquire.cores import limit_blas
+from acquire.cores import limit_threads
 from acquire.errors import AcquireError
 from acquire.fibre import Tile
 from acquire.flags import NO_IMAGE
@@ -175,7 +175,6 @@ def glimpses(client: Client, is_over: Callable[[], bool]) -> Iterator[bytes]:
 
 def main() -> None:
     os.nice(_NICE)
-    limit_blas(1)
     over = threading.Event()
 
     def end_with_owner() -> None:
@@ -183,6 +182,11 @@ def main() -> None:
         over.set()
 
     threading.Thread(target=end_with_owner, daemon=True).start()
+    with limit_threads(1):
+        _serve(over)
+
+
+def _serve(over: threading.Event) -> None:
     out = sys.stdout.buffer
     while not over.is_set():
         try:
