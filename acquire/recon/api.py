@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import time
-from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from acquire.arrays import Dtype, open_arrays
-from acquire.cores import idle_cores, limit_threads
+from acquire.cores import granted_threads, idle_cores, limit_blas, limit_threads
 from acquire.recon.aliasing import detect_unresolved_light
 from acquire.recon.balance import balance_of, divided
 from acquire.recon.clock import IterationClock
@@ -128,8 +127,9 @@ def reconstruct(
     clock = IterationClock(count, budget_s, progress, stop, began)
     segment, balance_warnings, balance_facts = _balanced(segment)
     held_out = HOLD_OUT if chosen.holds_out and static_image is None else 0.0
-    # threads waiting for a core that other processes use would make times unpredictable
-    with limit_threads(idle_cores()) if budget_s is not None else nullcontext():
+    # BLAS's threads busy-wait for a core that others use; the arms are computed side by side instead
+    threads = 1 if granted_threads() == 1 else idle_cores()
+    with limit_threads(threads), limit_blas(1):
         if budget_s is not None and refuse and arrays.compiled:
             least_s = least_seconds(segment.geometry, spatial_merge, temporal_merge, solver)
             check_budget(clock, budget_s, least_s)

@@ -4,6 +4,9 @@ Line ``i`` weighs the voxels of row block ``q`` with m(d)·E(t) along a staircas
 the cosines this is one number per (line, row block, cosine), so that B is two dense matrix products with one
 factor of shape (L_R, n′·K), which is the same for both arms up to the order of the rows. For K ≪ T this is
 far less work than synthesising the video and shearing it.
+
+The arms are computed side by side if each takes long enough. The threads of a BLAS would gain no more, and
+busy-wait for one another: beside two other programs, two threads took ten times as long as one.
 """
 
 from __future__ import annotations
@@ -12,8 +15,10 @@ from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from array_api_compat import is_numpy_array
 
 from acquire.arrays import host
+from acquire.cores import granted_threads, side_by_side
 from acquire.forward import (
     DualArm,
     GatheredArms,
@@ -36,6 +41,9 @@ if TYPE_CHECKING:
 
 
 LARGEST_FACTORS_BYTES = 1 << 30
+WORTH_A_THREAD = 1e8
+"""Number of multiplications of an arm (about two milliseconds) from which the arms are computed side by
+side."""
 
 
 def band_operator(
@@ -98,17 +106,16 @@ class BandOperator:
         views = (  # (block, K, across)
             self._xp.permute_dims(each, axes) for each, axes in ((theta, (1, 0, 2)), (view_b, (2, 0, 1)))
         )
-        return self._xp.stack(
-            [self._arm(*each) for each in zip(self._factors, self._mergings, views, strict=True)]
-        )
+        first, second = views
+        return self._xp.stack(self._both(lambda: self._arm(0, first), lambda: self._arm(1, second)))
 
     def adjoint(self, lines: Array) -> Array:
         """Bᵀ·y."""
         K, side, _ = self.theta_shape
-        rows, columns = (
-            self._xp.reshape(self._arm_adjoint(*pair, lines[arm, ...]), (side, K, side))
-            for arm, pair in enumerate(zip(self._factors, self._mergings, strict=True))
+        flat = self._both(
+            lambda: self._arm_adjoint(0, lines[0, ...]), lambda: self._arm_adjoint(1, lines[1, ...])
         )
+        rows, columns = (self._xp.reshape(each, (side, K, side)) for each in flat)
         view_b = self._xp.permute_dims(columns, (1, 2, 0))
         back = view_b if self._registration is None else self._registration.adjoint(view_b)
         return self._xp.permute_dims(rows, (1, 0, 2)) + back
@@ -131,15 +138,23 @@ class BandOperator:
         exact = [host(factor).astype(np.float64) for factor in self._factors]
         return [float(size) * (factor @ factor.T) for size, factor in zip(each, exact, strict=True)]
 
-    def _arm(self, factor: Array, merging: Array, view: Array) -> Array:
+    def _both(self, first: Callable[[], Array], second: Callable[[], Array]) -> tuple[Array, Array]:
+        """Results of both arms, side by side where that is worth a thread and the cores are free."""
+        factor, pixels = self._factors[0], self.lines_shape[2]
+        worth = is_numpy_array(factor) and factor.size * pixels > WORTH_A_THREAD
+        return side_by_side(first, second) if worth and granted_threads() > 1 else (first(), second())
+
+    def _arm(self, arm: int, view: Array) -> Array:
         """Lines of an arm; columns are merged into pixels on the smaller side of the product."""
+        factor, merging = self._factors[arm], self._mergings[arm]
         side, pixels = merging.shape
         blocks = self._xp.reshape(view, (-1, side))
         return factor @ (blocks @ merging) if side > pixels else (factor @ blocks) @ merging
 
-    def _arm_adjoint(self, factor: Array, merging: Array, arm: Array) -> Array:
+    def _arm_adjoint(self, arm: int, lines: Array) -> Array:
+        factor, merging = self._factors[arm], self._mergings[arm]
         side, pixels = merging.shape
-        return (factor.T @ arm) @ merging.T if side > pixels else factor.T @ (arm @ merging.T)
+        return (factor.T @ lines) @ merging.T if side > pixels else factor.T @ (lines @ merging.T)
 
 
 class InBasis:

@@ -1,10 +1,9 @@
 """Scenes that blink: first cosines of the whole band, then patterns and curves if a few hold the scene.
 
-    cosines ── few patterns? ── yes ─▶ patterns and curves at full resolution
+    cosines ── few patterns? ── yes ─▶ patterns and curves at full resolution (`settling`)
                 └────────────── no ──▶ more iterations in the cosines
 
-The held-out samples end the refinement, and the round that predicted them best is the result: at full
-resolution there is no model error to fit, so that they are predicted better as long as the picture improves.
+Nothing here uses the truth: the held-out samples judge what is found.
 """
 
 from __future__ import annotations
@@ -20,7 +19,8 @@ from acquire.recon.band import band_operator
 from acquire.recon.bandwidth import FEWEST_COEFFICIENTS, MARGIN, estimate_coefficients, light_beyond
 from acquire.recon.basis import TemporalBasis, resized
 from acquire.recon.estimates import InBand, Refined
-from acquire.recon.patterns import LEAST_NEED, PARAMETERS, ROUND, Refinement, find_patterns
+from acquire.recon.patterns import PARAMETERS, ROUND, Refinement, find_patterns
+from acquire.recon.settling import settle
 
 if TYPE_CHECKING:
     from acquire.arrays import Array
@@ -30,8 +30,10 @@ if TYPE_CHECKING:
     from acquire.recon.options import SolveOptions
     from acquire.recon.problem import Problem
 
-FIRST_LOOK, LONGER_LOOK = 60, 90
-"""Number of iterations in the cosines before patterns are looked for; the latter if patterns are in doubt."""
+GLANCE, FIRST_LOOK, LONGER_LOOK = 20, 60, 90
+"""Number of iterations in the cosines before they are compared with other priors (and before it is decided
+whether few frames explain the lines), and before patterns are looked for; the last if patterns are in
+doubt."""
 FIRST_LOOK_SHARE, LONGER_SHARE = 0.7, 0.4
 """Upper limit on the first look's share of the budget, and the share after which it is not made longer."""
 BEYOND_S = 2e-6
@@ -50,38 +52,23 @@ USUAL_FRAMES = 980
 FEW_FRAMES = 32
 HELD_BACK = 100.0
 """Factor of the penalties for few frames unless they explain the lines."""
-TRIAL = 20
-"""Number of iterations after which it is decided whether few frames explain the lines."""
 EXPLAINED = 0.1
 """Relative prediction error below which they do, and below which cosines start from a still."""
 STILL = AdmmParameters(tv_weight=5e-6, tv_penalty=1e-5, sign_penalty=3e-6, gradient_steps=6)
 """Parameters for a single frame. All sub-steps add up in it, so that the mean light has an eigenvalue some
 thousand times that of a detail: lower penalties admit details, and more gradient steps reach them."""
-LEAST_GAIN = 0.003
-"""Smallest relative gain of the held-out prediction for which a round counts as an improvement."""
-PATIENCE = 6
-"""Number of rounds without improvement that end a refinement."""
-TRIAL_ROUNDS = 2
-"""Number of rounds after which superfluous patterns are recognised."""
-LONGEST_TRIAL = 2
-"""Largest number of times that as many rounds are made without them."""
 WEIGHT_PER_NOISE = 0.17
 """λ of the first round relative to the lines' noise."""
 NOISE_SHARE = 0.7
 """Share of noise in the first look's prediction error, for cameras whose noise is unknown."""
-LOOSENED_IN_VAIN = 3
-"""Number of rounds without improvement after which λ is no longer lowered: noise is being fitted."""
-TIGHTER = 2.0
-"""λ from then on, relative to that of the best round, which lagged behind the λ that it was given."""
-LEAST_GAIN_HELD = 5e-4
-"""`LEAST_GAIN` from then on: next to the noise, what is still gained is small."""
 
 
 def solve_in_cosines(
     segment: Segment, problem: Problem, options: SolveOptions, clock: IterationClock
 ) -> Estimate:
     """Solve in cosines, then as patterns and curves if the scene consists of a few."""
-    return refine(segment, problem, options, clock, first_look(segment, problem, options, clock))
+    first = first_look(segment, problem, options, clock)
+    return refine(segment, problem, options, clock, first)
 
 
 def first_look(
@@ -92,8 +79,21 @@ def first_look(
     still: Array | None = None,
 ) -> InBand:
     """A first look in the requested or estimated band, from the coefficients (1, n′, n′) of a still."""
+    first = glance(segment, problem, options, clock, still)
+    complete_look(first, options, clock)
+    return first
+
+
+def glance(
+    segment: Segment,
+    problem: Problem,
+    options: SolveOptions,
+    clock: IterationClock,
+    still: Array | None = None,
+) -> InBand:
+    """The first iterations of a first look, after which it can be compared with other priors."""
     count = find_band(segment, problem, options, clock)
-    return _look(segment, problem, options, clock, count=count, still=still)
+    return _glance(segment, problem, options, clock, count=count, still=still)
 
 
 def refine(
@@ -116,7 +116,8 @@ def refine(
         return found
     clock.reset()
     count = round(MARGIN * (beyond + 1))
-    first = _look(segment, problem, options, clock, count=count, still=first.solver.theta[:1, ...])
+    first = _glance(segment, problem, options, clock, count=count, still=first.solver.theta[:1, ...])
+    complete_look(first, options, clock)
     wider = _refine(segment, problem, options, clock, first)
     better = problem.prediction_error(wider.predict()) < problem.prediction_error(predicted)
     return wider if better else found
@@ -134,7 +135,7 @@ def _refine(
     return first
 
 
-def _look(
+def _glance(
     segment: Segment,
     problem: Problem,
     options: SolveOptions,
@@ -173,18 +174,27 @@ def _look(
     if options.initial is not None:
         start = basis.analyze(problem.arrays.asarray(options.initial / problem.scale))
     estimate = begin(start)
-    if 1 < frames <= FEW_FRAMES:
-        for _ in clock.run(TRIAL, "first look", FIRST_LOOK_SHARE, estimate.video):
-            estimate.solver.step()
-        if problem.prediction_error(estimate.predict()) < EXPLAINED:
-            estimate = begin(estimate.solver.theta, explained=True)
-    for look in (FIRST_LOOK, LONGER_LOOK):
-        most = min(look, -(-4 * options.iterations // 5))
-        for _ in clock.run(most - clock.done, "first look", FIRST_LOOK_SHARE, estimate.video):
-            estimate.solver.step()
-        if find_patterns(host(estimate.solver.theta), beyond_doubt=True) or clock.spent(LONGER_SHARE):
-            break
+    for _ in clock.run(_at_most(GLANCE, options), "first look", FIRST_LOOK_SHARE, estimate.video):
+        estimate.solver.step()
+    few = 1 < frames <= FEW_FRAMES
+    if few and problem.prediction_error(estimate.predict()) < EXPLAINED:
+        estimate = begin(estimate.solver.theta, explained=True)
     return estimate
+
+
+def complete_look(first: InBand, options: SolveOptions, clock: IterationClock) -> None:
+    """Continue a first look until it shows whether the scene is a sum of a few patterns."""
+    for look in (FIRST_LOOK, LONGER_LOOK):
+        rest = _at_most(look, options) - clock.done
+        for _ in clock.run(rest, "first look", FIRST_LOOK_SHARE, first.video):
+            first.solver.step()
+        if find_patterns(host(first.solver.theta), beyond_doubt=True) or clock.spent(LONGER_SHARE):
+            break
+
+
+def _at_most(look: int, options: SolveOptions) -> int:
+    """Number of iterations of a first look, which leaves some for what follows it."""
+    return min(look, -(-4 * options.iterations // 5))
 
 
 def _in_patterns(
@@ -204,37 +214,10 @@ def _in_patterns(
     merges = (options.spatial_merge, options.temporal_merge)
     clock.reset()  # the limit holds for each stage: the first look takes longer where patterns are in doubt
     refinement = Refinement(segment, problem, basis, found, merges, _for_noise(segment, problem, first))
-    refinement = _with_needed_patterns(refinement, problem, clock)
-    best, kept, idle = np.inf, refinement.found, 0
-    best_weight, held_best, recent = refinement.parameters.tv_weight, np.inf, np.inf
-    for _ in clock.run(clock.iterations - clock.done, "refine", video=refinement.video):
-        weight = refinement.parameters.tv_weight
-        refinement.step()
-        if not refinement.at_round_end:
-            continue
-        error = problem.prediction_error(refinement.predict())
-        # without held-out samples the error is NaN, which never counts as idle
-        least_gain = LEAST_GAIN if refinement.loosens else LEAST_GAIN_HELD
-        idle = idle + 1 if error >= (1 - least_gain) * recent else 0
-        recent = min(recent, error)
-        if not error >= best:
-            best, kept, best_weight = error, refinement.found, weight
-        if refinement.loosens and idle == LOOSENED_IN_VAIN:
-            held_best = recent
-            refinement.hold(TIGHTER * best_weight)
-        elif idle == PATIENCE and not refinement.loosens and recent < (1 - LEAST_GAIN) * held_best:
-            held_best = recent
-            refinement.hold(weight / TIGHTER)
-        elif idle == PATIENCE:
-            clock.converged()
-            break
-        else:
-            continue
-        recent, idle = np.inf, 0
-    refinement.return_to(kept)
-    if problem.prediction_error(first.predict()) < best < np.inf:
-        return None
-    return Refined(refinement, basis.count)
+    refinement = settle(refinement, problem, clock)
+    # without held-out samples both are NaN
+    worse = problem.prediction_error(first.predict()) < problem.prediction_error(refinement.predict())
+    return None if worse else Refined(refinement, basis.count)
 
 
 def _for_noise(segment: Segment, problem: Problem, first: InBand) -> AdmmParameters:
@@ -246,34 +229,6 @@ def _for_noise(segment: Segment, problem: Problem, first: InBand) -> AdmmParamet
     if not noise < np.inf:
         noise = NOISE_SHARE * problem.prediction_error(first.predict())
     return replace(PARAMETERS, tv_weight=max(PARAMETERS.tv_weight, WEIGHT_PER_NOISE * noise))
-
-
-def _with_needed_patterns(refinement: Refinement, problem: Problem, clock: IterationClock) -> Refinement:
-    """The refinement after a few rounds, without superfluous patterns.
-
-    The first look tells patterns from its own errors by their energy alone, and may find too many. Without
-    the doubtful ones, the held-out samples must be predicted as well after equally many rounds, or not much
-    worse after a few and as well after more, since the other patterns have to take their light back first.
-    In these rounds the held-out error still rises and falls by a fifth.
-    """
-
-    def refine(start: Refinement) -> float:
-        for _ in clock.run(TRIAL_ROUNDS * ROUND, "refine", video=start.video):
-            start.step()
-        return problem.prediction_error(start.predict())
-
-    error = refine(refinement)
-    needed = refinement.needed() if error < np.inf else refinement.found
-    if needed.curves.shape[1] == refinement.rank:
-        return refinement
-    fewer = refinement.restricted(needed)
-    for _ in range(LONGEST_TRIAL):
-        without, error = refine(fewer), refine(refinement)
-        if without <= error:
-            return fewer
-        if without > (1 + LEAST_NEED) * error:
-            break
-    return refinement
 
 
 def find_band(segment: Segment, problem: Problem, options: SolveOptions, clock: IterationClock) -> int:

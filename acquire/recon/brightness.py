@@ -1,8 +1,10 @@
 """The brightness of a whole scene over time: g in X(r, c, t) = g(t)·V(r, c, t), from all lines at once.
 
 With V known, a line is linear in g: Y(i, ·) = Σ_t g(t)·E(t)·V's light along the line's staircase (Eq. 1).
-There are a few hundred unknowns for all samples, so that least squares is enough; if V contains part of the
-brightness already, g stays near 1.
+There are a few hundred unknowns for all samples; if V contains part of the brightness already, g stays near
+1. The lines carry no information about sub-steps without light: with more cosines than g needs, least squares
+would let it run wild between two flashes. Each cosine of g − 1 therefore has an energy γ that it shares with
+its neighbours; γ and the noise σ² are those for which the lines are most likely, as in `curves`.
 """
 
 from __future__ import annotations
@@ -10,6 +12,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from scipy.ndimage import uniform_filter1d
 
 from acquire.forward import column_merging
 from acquire.recon.basis import TemporalBasis
@@ -21,7 +24,15 @@ if TYPE_CHECKING:
     from acquire.recon.problem import Problem
 
 RIDGE = 1e-3
-"""Ridge relative to the mean eigenvalue: it draws g to 1 where the lines carry no information about it."""
+"""Ridge of the start relative to the mean eigenvalue: it draws g to 1 where no line has information on it."""
+EVIDENCE_STEPS = 12
+NEIGHBOURS = 9
+"""Number of neighbouring cosines that share their energy: the light of one lamp is rarely in a single one."""
+FAINTEST = 1e-10
+"""Smallest energy, noise and precision relative to the largest energy, the lines' and the mean eigenvalue:
+smaller ones would never come back, or leave the equations singular."""
+LEAST_DETERMINED = 0.01
+"""Smallest share of an unknown that counts as determined by the lines; it bounds a step of its energy."""
 DIMMEST = 0.02
 """Smallest brightness relative to the mean; dimmer instants would not be seen at all."""
 
@@ -45,7 +56,7 @@ def fit_brightness(
     frame, row = np.arange(geometry.span) // temporal_merge, np.arange(n) // spatial_merge
     lit = (basis[:, frame] * segment.code).T.astype(np.float32)
     merging = column_merging(geometry, spatial_merge).astype(np.float32)
-    normal, right = np.zeros((cosines, cosines)), np.zeros(cosines)
+    normal, right, energy, samples = np.zeros((cosines, cosines)), np.zeros(cosines), 0.0, 0
     for arm, view in enumerate((video, video.transpose(0, 2, 1)[:, ::-1])):
         pixels = view.astype(np.float32) @ merging
         for line in np.flatnonzero((problem.weight[arm] > 0).any(axis=1)):
@@ -56,11 +67,42 @@ def fit_brightness(
                 seen += pixels[frame[instants], row].T @ lit[instants]
             rows = seen[used].astype(np.float64)
             normal += rows.T @ rows
-            right += rows.T @ (problem.samples[arm, line][used] * problem.norm)
+            lines = problem.samples[arm, line][used].astype(np.float64) * problem.norm
+            right += rows.T @ lines
+            energy, samples = energy + float(lines @ lines), samples + len(lines)
     if not normal.any():
         return np.ones(frames)  # a dark video explains nothing, however bright
     flat = basis @ np.ones(frames)
-    damping = RIDGE * np.trace(normal) / cosines
-    change = np.linalg.solve(normal + damping * np.eye(cosines), right - normal @ flat)
+    left = energy - 2 * float(flat @ right) + float(flat @ normal @ flat)
+    change = _most_likely(normal, right - normal @ flat, left, samples)
     brightness = np.maximum(basis.T @ (flat + change), DIMMEST)
     return np.asarray(brightness / brightness.mean())
+
+
+def _most_likely(
+    normal: NDArray[np.float64], right: NDArray[np.float64], energy: float, samples: int
+) -> NDArray[np.float64]:
+    """The solution x (K,) of normal·x = right with the prior for which the lines are most likely.
+
+    ``energy`` is the sum of the squares of the ``samples``. The lines determine a share of each unknown; its
+    energy is its square over that share (MacKay, Neural Comput. 4, 415 (1992)).
+    """
+    diagonal = np.diag_indices_from(normal)
+    damped, mean_eigenvalue = normal.copy(), np.trace(normal) / len(normal)
+    damped[diagonal] += RIDGE * mean_eigenvalue
+    x: NDArray[np.float64] = np.asarray(np.linalg.solve(damped, right), np.float64)
+    share, noise = np.full(len(x), np.square(x).mean()), energy / samples
+    for _ in range(EVIDENCE_STEPS):
+        if share.max() < FAINTEST**2 or not noise > 0:
+            break  # g is 1, or explains the lines exactly
+        precision = noise / np.maximum(share, FAINTEST * share.max())
+        precision = np.maximum(precision, FAINTEST * mean_eigenvalue)
+        damped = normal.copy()
+        damped[diagonal] += precision
+        inverse = np.linalg.inv(damped)
+        x = np.asarray(inverse @ right, np.float64)
+        determined = np.clip(1 - precision * np.diag(inverse), LEAST_DETERMINED, 1)
+        share = uniform_filter1d(np.square(x) / determined, NEIGHBOURS, mode="nearest")
+        left = energy - 2 * float(x @ right) + float(x @ normal @ x)
+        noise = max(left, FAINTEST * energy) / max(samples - float(determined.sum()), 1.0)
+    return x

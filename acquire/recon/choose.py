@@ -14,18 +14,30 @@ those in the code are starting points of searches.
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, ClassVar
 
+import numpy as np
+
 from acquire.arrays import host
-from acquire.recon.blinking import EXPLAINED, first_look, refine, solve_in_cosines
-from acquire.recon.estimates import Preferred
+from acquire.recon.blinking import (
+    EXPLAINED,
+    FIRST_LOOK_SHARE,
+    GLANCE,
+    LONGER_LOOK,
+    complete_look,
+    glance,
+    refine,
+    solve_in_cosines,
+)
+from acquire.recon.estimates import Preferred, Refined
 from acquire.recon.holdout import HeldOut
 from acquire.recon.patterns import find_patterns
 from acquire.recon.reuse import reuse_choice
 from acquire.recon.solver import Preset, Solver
 from acquire.recon.still import best_still, change_bench, weighted_like
 from acquire.recon.workbench import (
+    BRIGHTER,
     CALM,
     FIRST_ITERATIONS,
     LEAST_GAIN,
@@ -49,8 +61,8 @@ if TYPE_CHECKING:
 ITERATIONS_PER_TRIAL = 10
 """Iterations of a preset for each trial of a search."""
 OUTDONE = 0.6
-"""Largest error of the cosines, relative to the other candidates, that makes the search for a better volume
-unnecessary."""
+"""Largest error of the cosines at a glance, relative to the other candidates, for which they are continued
+before the others are searched. The glance of lamps has 0.25 to 0.55."""
 FAR = 1.25
 """Largest error of a smooth volume or a still, relative to the volume's, for which it is searched further."""
 SMOOTHER = 0.85
@@ -61,7 +73,10 @@ CLEARLY = 0.97
 the still where its prior is strong, and need only be better."""
 CLOSE, DOUBTFUL = 1.1, 2.0
 """Largest error of the cosines, relative to the best trial's, for which they are continued, and for which
-they are if clear patterns were found."""
+they are if clear patterns were found, or if only a glance was taken."""
+FREER = 0.85
+"""Largest error of cosines that are no patterns, relative to that of a still or a volume, for which they are
+preferred: they admit the most noise. With equal errors a volume is 2 to 8 dB better."""
 
 
 class AdmmSolver(Solver):
@@ -107,32 +122,53 @@ def _choose(
 ) -> Estimate:
     """Compare a first volume with a still, the cosines and the other priors, and solve with the best.
 
-    The cosines are tried before better stills are searched for: a scene that blinks needs most of a budget
-    for them, and yet a still of it may explain the lines to 10 %.
+    Scenes that blink need most of a budget for the cosines, and others need it for the search: a glance
+    decides which comes first. Many cosines take ten times as long as a trial of the others.
     """
-    problem, clock, held_out = bench.problem, bench.clock, bench.held_out
-    still = plain = bench.attempt(bench.fitting(STILL), FIRST_ITERATIONS)
-    at_rest = plain.error < EXPLAINED and not held_out.clearly_less(volume.errors, plain.errors)
-    start = plain.coefficients if at_rest else None
-    cosines = first_look(segment, problem, options, clock, start)
-    bench.record_errors({"prior": "cosines"} | cosines.facts(), cosines.predict())
-    best, error = _better(volume, plain), bench.error(cosines.predict())
-    ahead = error <= OUTDONE * best.error
-    blinks = ahead and _has_clear_patterns(cosines)
-    if plain.error < min(EXPLAINED, FAR * volume.error) and not blinks:
-        still = best_still(plain, trials, merge=options.spatial_merge)
-        best = _better(volume, still)
-        ahead = error <= OUTDONE * best.error
-    if not ahead:
-        best = _search(bench, plain, still, volume, cosines, trials)
-    elif not clock.spent(SEARCH_SHARE) and not blinks:
-        best = _challenge(bench, plain, cosines, trials) or best
-    if _worth_refining(bench, cosines, still, best):
+    problem, clock = bench.problem, bench.clock
+    plain = bench.attempt(bench.fitting(STILL), FIRST_ITERATIONS)
+    at_rest = plain.error < EXPLAINED and not bench.held_out.clearly_less(volume.errors, plain.errors)
+    cosines = glance(segment, problem, options, clock, plain.coefficients if at_rest else None)
+    rest_s = (LONGER_LOOK - GLANCE) * clock.longest_s
+    errors = bench.record_errors({"prior": "cosines"} | cosines.facts(), cosines.predict())
+    at_a_glance, clear = bench.held_out.relative(errors), _has_clear_patterns(cosines)
+    tried = _Tried(volume, plain)
+    if not clear:
+        tried.smooth = bench.probe(bench.fitting(SMOOTH), min(at_a_glance, tried.best.error))
+        picture = host(cosines.basis.matrix()[0, 0] * cosines.solver.theta[0, ...]).clip(0)
+        tried.bright = bench.brighten(picture, cosines.basis.count, min(at_a_glance, tried.best.error))
+    ahead, refined = at_a_glance <= OUTDONE * tried.best.error, None
+    if ahead:
+        complete_look(cosines, options, clock)
+        if find_patterns(host(cosines.solver.theta)) is not None:
+            refined = refine(segment, problem, options, clock, cosines)
+            if (clear or isinstance(refined, Refined)) and _wins(bench, refined, tried.best):
+                return Preferred(refined, bench.record)
+    best = _search(bench, tried, trials, bench.error(cosines.predict()) if ahead else np.inf)
+    near = at_a_glance < DOUBTFUL * best.error and clock.affords(rest_s, FIRST_LOOK_SHARE)
+    if not ahead and near:
+        complete_look(cosines, options, clock)
+    if refined is None and (ahead or near) and _worth_refining(bench, cosines, best):
         refined = refine(segment, problem, options, clock, cosines)
-        errors = bench.record_errors({"prior": "patterns"} | refined.facts(), refined.predict())
-        if held_out.clearly_less(errors, best.errors):
-            return Preferred(refined, bench.record)
+    if refined is not None and _wins(bench, refined, best):
+        return Preferred(refined, bench.record)
     return bench.finish(best)
+
+
+@dataclass
+class _Tried:
+    """First trials: a volume, a still and, unless patterns are clear, a smooth volume and one of changing
+    brightness (None if the brightness is steady)."""
+
+    volume: Trial
+    plain: Trial
+    smooth: Trial | None = None
+    bright: Trial | None = None
+
+    @property
+    def best(self) -> Trial:
+        trials = (self.volume, self.plain, self.smooth, self.bright)
+        return min((trial for trial in trials if trial is not None), key=_error)
 
 
 def _better(moving: Trial, still: Trial) -> Trial:
@@ -140,25 +176,46 @@ def _better(moving: Trial, still: Trial) -> Trial:
     return moving if moving.error < most * still.error else still
 
 
-def _search(
-    bench: Workbench, plain: Trial, still: Trial, volume: Trial, cosines: InBand, trials: int
-) -> Trial:
+def _wins(bench: Workbench, refined: Estimate, best: Trial) -> bool:
+    """Whether patterns predict clearly better than the best trial, and cosines that are none much better.
+
+    What happens in a few blocks of lines only, as a flash, is not clear by its standard error.
+    """
+    errors = bench.record_errors({"prior": "patterns"} | refined.facts(), refined.predict())
+    clear = bench.held_out.clearly_less(errors, best.errors)
+    much = bench.held_out.relative(errors) < FREER * best.error
+    if isinstance(refined, Refined):
+        return clear or much
+    return clear and (much or best.candidate.prior == SMOOTH.prior)
+
+
+def _search(bench: Workbench, tried: _Tried, trials: int, rival: float) -> Trial:
     """The best of stills, volumes, smooth volumes and volumes of changing brightness.
 
-    ``plain`` is the first still, ``still`` the best one, which is the same if it was not searched for.
+    Of candidates that are far from the error of a ``rival``, only the first trials are made.
     """
-    if still is plain and still.error < FAR * volume.error:
-        plain = still = bench.climb(still, trials)
-    calm = bench.attempt(bench.fitting(CALM), FIRST_ITERATIONS, still)
-    bright = bench.brighten(plain, cosines.basis.count)
-    moving = [volume, calm, bright or calm]
+    plain = still = tried.plain
+    calm = bench.attempt(bench.fitting(CALM), FIRST_ITERATIONS, plain)
+    smooth = tried.smooth or bench.attempt(bench.fitting(SMOOTH), FIRST_ITERATIONS)
+    volume = min((tried.volume, calm), key=_error)
+    bright = tried.bright
+    # to a brightness, a flash in front of a still is the flash of everything
+    flickers = bright is not None and bench.held_out.clearly_less(bright.errors, plain.errors)
+    if bright is not None and flickers and bright.error < BRIGHTER * volume.error:
+        volume = bright
+    if plain.error < FAR * volume.error:
+        explains = plain.error < EXPLAINED
+        merge = bench.options.spatial_merge
+        still = best_still(plain, trials, merge=merge) if explains else bench.climb(plain, trials)
     if still is not plain:
         candidate = replace(weighted_like(still, bench.fitting(VOLUME)), change=True)
-        moving.append(change_bench(bench, still).attempt(candidate, FIRST_ITERATIONS))
-    volume = min(moving, key=lambda trial: trial.error)
-    smooth = bench.attempt(bench.fitting(SMOOTH), FIRST_ITERATIONS)
-    volume = volume.bench.climb(volume, trials)
-    if smooth.error < FAR * volume.error:
+        change = change_bench(bench, still).attempt(candidate, FIRST_ITERATIONS)
+        volume = min((volume, change), key=_error)
+    if volume.error < FAR * rival:
+        volume = volume.bench.climb(volume, trials)
+        if volume.candidate.brightness:
+            volume = volume.bench.follow_brightness(volume)
+    if smooth.error < FAR * min(volume.error, rival):
         smooth = bench.climb(smooth, trials)
     flows = smooth.error < SMOOTHER * volume.error and bench.held_out.clearly_less(
         smooth.errors, still.errors
@@ -166,32 +223,16 @@ def _search(
     return _better(smooth if flows else volume, still)
 
 
-def _challenge(bench: Workbench, plain: Trial, cosines: InBand, trials: int) -> Trial | None:
-    """A scene that flickers as a whole or flows, if that predicts better than the cosines; else None.
-
-    It is tried where the cosines are far ahead of a still and of a volume, but show no clear patterns.
-    """
-    rival = bench.error(cosines.predict())
-    bright = bench.brighten(plain, cosines.basis.count, DOUBTFUL * rival)
-    smooth = bench.attempt(bench.fitting(SMOOTH), FIRST_ITERATIONS)
-    found = smooth if bright is None or smooth.error < SMOOTHER * bright.error else bright
-    flows = found is smooth
-    if found.error < FAR * rival:
-        found = bench.climb(found, trials)
-    return found if found.error < (SMOOTHER if flows else 1.0) * rival else None
-
-
-def _worth_refining(bench: Workbench, cosines: InBand, still: Trial, best: Trial) -> bool:
-    """Whether the first look in the cosines may still win, after more iterations or as patterns.
-
-    If it predicts no better than a still, it has found nothing.
-    """
+def _worth_refining(bench: Workbench, cosines: InBand, best: Trial) -> bool:
+    """Whether the first look in the cosines may still win, after more iterations or as patterns."""
     error = bench.error(cosines.predict())
-    if error > still.error:
-        return False
     if error < CLOSE * best.error:
         return True
     return error <= DOUBTFUL * best.error and _has_clear_patterns(cosines)
+
+
+def _error(trial: Trial) -> float:
+    return trial.error
 
 
 def _has_clear_patterns(cosines: InBand) -> bool:

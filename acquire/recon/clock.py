@@ -65,6 +65,7 @@ class IterationClock:
         self._compiled_before, self._excluded_s = compiled_s(), 0.0
         self._processor_began_s = time.process_time()
         self._recent_s: deque[float] = deque(maxlen=REMEMBERED)
+        self._stage = ""
         self._reserved = 0.0
 
     @property
@@ -128,27 +129,36 @@ class IterationClock:
             self._recent_s = before
 
     def run(
-        self, most: int, stage: str, share: float = 1.0, video: Callable[[], NDArray[Any]] | None = None
+        self,
+        most: int,
+        stage: str,
+        share: float = 1.0,
+        video: Callable[[], NDArray[Any]] | None = None,
+        *,
+        first: float = FIRST_OF_STAGE,
     ) -> Iterator[int]:
         """Yield before each iteration of a stage that may take ``share`` of the budget.
 
         ``video`` returns the current answer, dimensionless; it is passed to ``on_look`` after an iteration.
+        A new stage begins if ``first`` times the longest iteration before it fits.
 
         The very first iteration always runs, so that there is a result.
         """
         last = min(self.done + most, self.iterations)
-        expected = FIRST_OF_STAGE * self.longest_s
-        before, recent = self._recent_s, deque[float](maxlen=REMEMBERED)
-        self._recent_s = recent
+        expected, before = self.longest_s, self._recent_s
+        if stage != self._stage:
+            # a stage that goes on knows its longest iterations; a new one has others
+            expected, self._recent_s = first * expected, deque(maxlen=REMEMBERED)
         while self.done < last and self._may_continue(expected, share):
             begun = self.seconds
             yield self.done
             self.done += 1
             self._count(self.seconds - begun, stage)
             expected = self.longest_s
+            self._stage = stage
             if video is not None:
                 self.show(stage, video)
-        if not recent:
+        if not self._recent_s:
             self._recent_s = before
 
     def attempt(self, most: int, stage: str, share: float = 1.0) -> Iterator[int]:
@@ -156,7 +166,7 @@ class IterationClock:
 
         At least one runs. They are not shown: call `show` with the best candidate after a trial.
         """
-        self._recent_s = deque(maxlen=REMEMBERED)
+        self._recent_s, self._stage = deque(maxlen=REMEMBERED), ""
         for tried in range(most):
             if tried and (self._stopped() or not self.affords(self.longest_s, share)):
                 return

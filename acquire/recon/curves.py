@@ -207,24 +207,37 @@ class CurveOperator:
 
     def gram(self) -> Array:
         """The normal matrix of all samples in float64, unknowns in the order of (R, K)."""
-        K, R, exact = self._matrix.shape[0], self._rank, self._arrays.exact()
+        xp, K, R, exact = self._xp, self._matrix.shape[0], self._rank, self._arrays.exact()
         gram = exact.zeros((R, K, R, K))
+        lit = self._arrays.indices(np.flatnonzero(host(self._code)))
         # float64: rounding in float32 could make it indefinite
-        shaped = [self._xp.reshape(exact.asarray(each), (R, self._width, -1)) for each in self._profiles]
+        cosines = exact.asarray(xp.take(self._matrix, xp.take(self._frame, lit), axis=1))
+        cosines *= exact.asarray(xp.take(self._code, lit))
+        shaped = [xp.reshape(exact.asarray(each), (R, self._width, -1)) for each in self._profiles]
         for k in range(R):
             for other in range(k + 1):
-                pair = self._pair(sum(each[k, ...] @ each[other, ...].T for each in shaped))
+                Q = sum(each[k, ...] @ each[other, ...].T for each in shaped)
+                pair = cosines @ self._between(Q, lit) @ cosines.T
                 gram[k, :, other, :], gram[other, :, k, :] = pair, pair.T
-        return self._xp.reshape(gram, (R * K, R * K))
+        return xp.reshape(gram, (R * K, R * K))
 
-    def _pair(self, Q: Array) -> Array:
-        """D·(E·Eᵀ ∘ Σ_i Q shifted by iS)·Dᵀ for one pair of patterns."""
-        total = self._arrays.exact().zeros((self._geometry.span, self._geometry.span))
-        for first in self._firsts:
-            total[first : first + self._width, first : first + self._width] += Q
-        total *= self._code[:, None]
-        total *= self._code
-        return self._to_cosines(self._to_cosines(total).T).T
+    def _between(self, Q: Array, lit: Array) -> Array:
+        """Σ_i Q(t − iS, t' − iS) for one pair of patterns, at the sub-steps with light."""
+        total = self._shifted(Q, self._geometry.lines)
+        return self._xp.take(self._xp.take(total, lit, axis=0), lit, axis=1)
+
+    def _shifted(self, Q: Array, lines: int) -> Array:
+        """Σ_i Q shifted by iS in both directions, from the sum for half of the lines."""
+        if lines == 1:
+            return Q
+        half, S = self._shifted(Q, lines // 2), self._geometry.substeps
+        parts = [(0, half), (lines // 2 * S, half)] + [((lines - 1) * S, Q)] * (lines % 2)
+        span = self._width + (lines - 1) * S
+        total = self._arrays.exact().zeros((span, span))
+        for first, part in parts:
+            last = first + part.shape[0]
+            total[first:last, first:last] += part
+        return total
 
     @property
     def _firsts(self) -> range:

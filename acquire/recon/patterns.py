@@ -56,10 +56,9 @@ LARGEST_REST = 0.035
 LARGEST_REST_AT_GAP = 0.005
 """The same for patterns that end at a gap; it is smaller, because a bright still can hide what moves before
 it."""
-LEAST_NEED = 0.5
-"""Rise of the prediction error, without the weakest pattern, from which this pattern is surely needed. After
-two rounds it rises to 3.5 times or more without a lamp, also with noise; without a superfluous pattern it
-rises by a third at most, or falls."""
+NEEDED = 2.2
+"""Rise of the held-out error beyond the noise, as energy, from which the weakest pattern is surely needed.
+Without a lamp it rises to 2.5 times and more (1.9 in low light), without a superfluous pattern to twice."""
 FADING = 0.5
 """Power of (largest / own singular value) by which a pattern's λ is larger: weak patterns are smoother."""
 
@@ -242,6 +241,7 @@ class Refinement:
         """The strongest patterns of now, in pixels, without those that the held-out samples may not need.
 
         A pattern of the scene is needed by far, whereas one too many only absorbs errors of the others.
+        Without held-out samples all are needed.
         """
         found, flat = self.found, host(self.found.patterns).reshape(self.rank, -1).astype(np.float64)
         _, turn = np.linalg.eigh(flat @ flat.T)
@@ -252,13 +252,19 @@ class Refinement:
             patterns = (kept.T @ flat).reshape(-1, *found.patterns.shape[1:])
             return Patterns(found.curves @ kept, self._problem.arrays.asarray(patterns.astype(kept.dtype)))
 
-        error, needed = self._problem.prediction_error(self.predict()), self.rank
+        noise = self._problem.noise(self._segment)
+        floor = noise**2 if noise < np.inf else 0.0  # NaN if it is unknown
+
+        def beyond_noise() -> float:
+            return self._problem.prediction_error(self.predict()) ** 2 - floor
+
+        excess, needed = beyond_noise(), self.rank
         while needed > 1:
             self.return_to(strongest(needed - 1))
-            without = self._problem.prediction_error(self.predict())
-            if not without < (1 + LEAST_NEED) * error:
+            without = beyond_noise()
+            if not without < NEEDED * excess:
                 break
-            error, needed = without, needed - 1
+            excess, needed = without, needed - 1
         self.return_to(found)
         return found if needed == self.rank else strongest(needed)
 

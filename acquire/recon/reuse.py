@@ -117,9 +117,11 @@ def reuse_choice(bench: Workbench, segment: Segment, options: SolveOptions, tria
         return bench.finish(still.bench.climb(still, trials)) if frames == 1 else None
     if choice.prior == COSINES:
         return _in_cosines(bench, still, segment, options)
-    bright = bench.brighten(still, choice.brightness) if choice.brightness else None
-    if bright is None and choice.brightness:
-        return None
+    bright = None
+    if choice.brightness:
+        bright = bench.brighten(bench.video(still)[0].clip(0), choice.brightness, still.error)
+        if bright is None or not bright.error < still.error:
+            return None
     moving = bench.attempt(choice.candidate(frames), FIRST_ITERATIONS, bright)
     best = moving if bench.held_out.clearly_less(moving.errors, still.errors) else still
     return bench.finish(_strengthened(best)) if choice.fits(best.error, noise) else None

@@ -49,10 +49,22 @@ LEAST_WEIGHT, LARGEST_WEIGHT = 1e-7, 1e3
 WEIGHT_STEP, PACE_STEP = 10**0.5, 4.0
 LEAST_GAIN = 0.02
 """Relative gain of the prediction that a weaker prior needs to be preferred; a stronger one needs none."""
-BRIGHT_STILLS, BRIGHT_ROUNDS = 2, 8
-"""Number of brightness fits in turn with a still, and in turn with a volume."""
-BRIGHTER = 0.85
-"""Largest error of a still of changing brightness, relative to a constant still, for which it is pursued."""
+BRIGHT_ROUNDS = 8
+"""Largest number of fits of the whole scene's brightness, in turn with a volume."""
+WIDER = 0.9
+"""Largest error of a brightness of twice as many cosines, relative to that before, for which it is preferred
+before the volume has been searched: it also follows the errors of an unfinished volume."""
+PURSUED = 0.95
+"""Largest error of such a round, relative to the one before, for which it is pursued while others predict
+better."""
+BRIGHTER = 0.9
+"""Largest error of a volume of changing brightness, relative to that of a constant one, for which it is
+preferred."""
+PROBE, HOPELESS = 10, 2.5
+"""Number of iterations after which a trial ends whose error is this many times that of a rival: the cosines'
+lead is 4 and more for lamps, and 1.3 to 2 for a flame or a scene that flickers as a whole."""
+STEADY = 0.03
+"""Standard deviation of a brightness that is left to the other priors."""
 USUAL_FRAMES, USUAL_ENERGY = 980, 7.1e-3
 """Number of frames and response to a voxel in Fig. 9, for which the candidates' weights are given."""
 
@@ -159,13 +171,14 @@ class Workbench:
         still: Trial | None = None,
     ) -> None:
         self._segment, self.problem, self.clock, self.held_out = segment, problem, clock, held_out
-        self._options, self._shared = options, shared or Shared()
+        self.options, self._shared = options, shared or Shared()
         self.fine, self.still = fine, still
         self.background = None if still is None else still.coefficients
         self._merges = (1 if fine else options.spatial_merge, options.temporal_merge)
         self.merge = options.spatial_merge if fine else 1
         self.frames, self._side, _ = segment.geometry.video_shape(*self._merges)
         self._brightness: NDArray[Any] | None = None
+        self._bright_cosines = self.frames
         self._operators: dict[tuple[int, bool], Operator] = {}  # successive trials mostly share one
         self._response = self._voxel_energy() / USUAL_ENERGY
 
@@ -177,7 +190,7 @@ class Workbench:
         self, problem: Problem, *, fine: bool | None = None, still: Trial | None = None
     ) -> Workbench:
         """Another bench for the same lines: with other weights, ``fine``, or for changes from a ``still``."""
-        kept = self._segment, problem, self._options, self.clock, self.held_out, self._shared
+        kept = self._segment, problem, self.options, self.clock, self.held_out, self._shared
         return Workbench(*kept, fine=self.fine if fine is None else fine, still=still)
 
     def merged(self, theta: Array) -> Array:
@@ -186,35 +199,50 @@ class Workbench:
             return theta
         return self.problem.arrays.asarray(merge_video(host(theta), self.merge, 1))
 
-    def brighten(self, still: Trial, cosines: int, most: float = np.inf) -> Trial | None:
-        """Fit a calm volume and the brightness of the whole scene in turn; None if the brightness is
-        constant.
+    def brighten(self, picture: NDArray[Any], cosines: int, rival: float) -> Trial | None:
+        """Fit the brightness of the whole scene and a calm volume in turn; None if the brightness is steady.
 
-        If the first volume's error exceeds ``most``, it is not refined.
+        The first fit is to ``picture`` (n′, n′), which moves nothing: the time mean of another video.
         """
         if self.clock.spent(SEARCH_SHARE):
             return None
-        lit = still
-        for _ in range(BRIGHT_STILLS):
-            self._fit_brightness(lit, cosines)
-            lit = self.attempt(replace(still.candidate, brightness=True), FIRST_ITERATIONS)
-            if not lit.error < BRIGHTER * still.error:
-                return None
-        best = lit = self.attempt(replace(self.fitting(CALM), brightness=True), FIRST_ITERATIONS, lit)
-        for _ in range(BRIGHT_ROUNDS if lit.error < most else 0):
-            self._fit_brightness(lit, cosines)
-            lit = self.attempt(lit.candidate, NEXT_ITERATIONS, lit)
-            if not lit.error < (1 - LEAST_GAIN) * best.error:
+        self._bright_cosines = min(cosines, self.frames)
+        self._fit_brightness(
+            np.broadcast_to(picture, (self.frames, *picture.shape)), None, self._bright_cosines
+        )
+        if self._brightness is None or self._brightness.std() < STEADY:
+            return None
+        best = self.probe(replace(self.fitting(CALM), brightness=True), rival)
+        return self.follow_brightness(best, rival, WIDER) if best.error < HOPELESS * rival else best
+
+    def follow_brightness(self, best: Trial, rival: float = np.inf, wider: float = 1 - LEAST_GAIN) -> Trial:
+        """Fit the brightness and a volume in turn as long as this improves the prediction.
+
+        When it no longer does, the brightness gets twice as many cosines: the error has to fall to ``wider``
+        times its value. As long as the ``rival`` predicts better, every round has to improve it clearly.
+        """
+        cosines = self._bright_cosines
+        for _ in range(BRIGHT_ROUNDS):
+            if self.clock.spent(SEARCH_SHARE):
                 break
-            best = lit
+            self._fit_brightness(np.maximum(self.video(best), 0), best.brightness, cosines)
+            found = self.attempt(best.candidate, NEXT_ITERATIONS, best)
+            widened = cosines > self._bright_cosines
+            usual = 1 - LEAST_GAIN if found.error < rival else PURSUED
+            improved = found.error < (wider if widened else usual) * best.error
+            if improved or (not widened and found.error < best.error):
+                best, self._bright_cosines = found, cosines
+            if not improved:
+                if widened or best.error >= rival or cosines == self.frames:
+                    break
+                cosines = min(self.frames, 2 * cosines)
         self._use_brightness(best.brightness)
         return best
 
-    def _fit_brightness(self, trial: Trial, cosines: int) -> None:
-        """Fit the brightness to a trial's video, and use it in the trials that follow."""
-        video = np.maximum(self.video(trial), 0)
-        light = np.ones(self.frames) if trial.brightness is None else trial.brightness
-        found = light * fit_brightness(self._segment, self.problem, video, self._merges, cosines)
+    def _fit_brightness(self, video: NDArray[Any], brightness: NDArray[Any] | None, cosines: int) -> None:
+        """Use the brightness that a video, which has a ``brightness`` already, needs in the next trials."""
+        found = fit_brightness(self._segment, self.problem, video, self._merges, cosines)
+        found = found if brightness is None else found * brightness
         self._use_brightness(found / found.mean())
 
     def _use_brightness(self, brightness: NDArray[Any] | None) -> None:
@@ -268,6 +296,12 @@ class Workbench:
             self.clock.show("choose", partial(self.video, trial))
         return trial
 
+    def probe(self, candidate: Candidate, rival: float) -> Trial:
+        """Solve a candidate from zero, which ends early if it is far behind the error of a rival."""
+        first = self.attempt(candidate, PROBE)
+        hopeless = first.error > HOPELESS * rival
+        return first if hopeless else self.attempt(candidate, FIRST_ITERATIONS - PROBE, first)
+
     def record_errors(
         self, candidate: dict[str, Any], predicted: NDArray[Any], began: float | None = None
     ) -> NDArray[np.float64]:
@@ -300,7 +334,7 @@ class Workbench:
             return theta
         if trial.bench.fine:
             return trial.admm.theta
-        n, merge = self._side, self._options.spatial_merge
+        n, merge = self._side, self.options.spatial_merge
         held = host(theta).repeat(merge, axis=1).repeat(merge, axis=2)[:, :n, :n]
         return self.problem.arrays.asarray(held)
 

@@ -109,3 +109,9 @@ def test_a_single_voxel_is_solved_to_the_last_digit() -> None:
     """Its residual becomes so small that its square vanishes."""
     result = reconstruct(record(Geometry(1, 3, 2), 10, 0.0), 3, 7, "fast", refuse=False)
     assert np.isfinite(result.video).all()
+
+
+def test_lines_that_do_not_determine_the_brightness_are_solved() -> None:
+    geometry = Geometry(1, 3, 2)
+    segment = damage(record(geometry, 8226, 0.0), "constant", 8226)
+    assert np.isfinite(reconstruct(segment, 1, 1, "fast", refuse=False).video).all()

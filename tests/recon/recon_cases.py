@@ -14,3 +14,16 @@ def cases(draw: st.DrawFn) -> tuple[Geometry, int, int, int, int]:
     N_m, T_m = draw(st.integers(1, g.size)), draw(st.integers(1, g.span + 1))
     frames = g.video_shape(N_m, T_m)[0]
     return g, N_m, T_m, draw(st.integers(1, frames)), draw(st.integers(0, 2**32 - 1))
+
+
+class Wall:
+    """A wall clock that only the test advances."""
+
+    def __init__(self) -> None:
+        self.now = 100.0
+
+    def monotonic(self) -> float:
+        return self.now
+
+    def process_time(self) -> float:
+        return self.now

@@ -8,6 +8,7 @@ from itertools import pairwise
 import numba
 import numpy as np
 import pytest
+from recon_cases import Wall
 
 from acquire.errors import UsageError
 from acquire.geometry import Geometry
@@ -15,19 +16,6 @@ from acquire.lines import Segment
 from acquire.recon import Look, reconstruct
 from acquire.recon import clock as clocks
 from acquire.recon.clock import IterationClock
-
-
-class Wall:
-    """A wall clock that only the test advances."""
-
-    def __init__(self) -> None:
-        self.now = 100.0
-
-    def monotonic(self) -> float:
-        return self.now
-
-    def process_time(self) -> float:
-        return self.now
 
 
 @pytest.fixture
@@ -76,6 +64,23 @@ def test_a_stage_with_longer_iterations_is_not_started_too_late(wall: Wall) -> N
     assert list(clock.run(1000, "refine")) == []
     assert clock.ended == "budget"
     assert clock.longest_s == pytest.approx(0.2)
+
+
+def test_a_stage_that_goes_on_is_no_new_one(wall: Wall) -> None:
+    clock = IterationClock(1000, 10.0)
+    for most in (95, 1000):  # at 8.55 s four times a long iteration no longer fits, but one does
+        for number in clock.run(most, "refine"):
+            wall.now += 0.41 if number % 5 == 4 else 0.01
+    assert clock.ended == "budget"
+    assert 8.8 < clock.seconds <= 10.0 - 0.02 * 10.0 - 1.5 * 0.41
+
+
+@pytest.mark.parametrize(("first", "begins"), [(4.0, True), (20.0, False)])
+def test_a_stage_says_how_long_its_beginning_may_take(wall: Wall, first: float, begins: bool) -> None:
+    clock = IterationClock(1000, 10.0)
+    for _ in clock.run(80, "first look"):
+        wall.now += 0.1
+    assert bool(list(clock.run(1, "refine", first=first))) == begins
 
 
 def test_the_first_iteration_runs_even_after_the_deadline(wall: Wall) -> None:

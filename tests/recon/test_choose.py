@@ -3,24 +3,28 @@
 from __future__ import annotations
 
 from functools import cache
+from threading import Event
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
-from recon_cases import cases
+from recon_cases import Wall, cases
 
 from acquire.codes import mix_seed, prbs
 from acquire.evaluate.metrics import psnr
 from acquire.forward import DualArm, merge_video
 from acquire.geometry import Geometry
 from acquire.lines import Segment
-from acquire.recon import reconstruct
+from acquire.recon import Progress, api, blinking, clock, reconstruct
+from acquire.recon.admm import Admm
 from acquire.recon.band import BandOperator
 from acquire.recon.bandwidth import light_beyond
 from acquire.recon.basis import TemporalBasis
 from acquire.recon.brightness import fit_brightness
 from acquire.recon.holdout import HeldOut
+from acquire.recon.options import SolveOptions
 from acquire.recon.problem import build_problem
+from acquire.recon.reuse import Choice
 from acquire.recon.workbench import LAST_ITERATIONS
 from acquire.sim.procedural import record
 
@@ -82,12 +86,20 @@ def test_the_prior_suits_the_scene(kind: str, prior: str, least_db: float) -> No
     assert result.quality.prediction <= min(each["error"] for each in tried) * 1.1
 
 
-def test_a_scene_that_flickers_as_a_whole_is_a_video_times_its_brightness() -> None:
-    result = reconstruct(segment("flicker"), 3, 1)
+@pytest.mark.parametrize("code_seed", [5, 8, 10])
+def test_a_scene_that_flickers_as_a_whole_is_a_video_times_its_brightness(code_seed: int) -> None:
+    result = reconstruct(segment("flicker", code_seed=code_seed), 3, 1)
     frames = GEOMETRY.trusted_frames(1)
     seen = result.video[frames].mean((1, 2))
     assert np.corrcoef(seen, BRIGHTNESS[frames])[0, 1] > 0.99
-    assert quality_db("flicker", result.video) > 22
+    assert quality_db("flicker", result.video) > 32
+
+
+def test_a_brightness_of_more_cosines_than_there_are_frames_can_be_handed_over() -> None:
+    choice = Choice("volume", 8, 2e-3, 16.0, error=0.02, noise=0.0, brightness=GEOMETRY.span)
+    result = reconstruct(segment("flicker"), 3, 24, "fast", choice=choice, check=False, error=False)
+    assert np.isfinite(result.video).all()
+    assert any(each.get("brightness") for each in result.parameters["candidates"])
 
 
 @pytest.mark.parametrize("code_seed", [6, 7])
@@ -96,7 +108,7 @@ def test_a_still_with_a_flash_in_front_shows_no_trace_of_the_code(code_seed: int
     still = reconstruct(lines, 3, GEOMETRY.span, "fast", check=False).video
     result = reconstruct(lines, 3, 1, "fast", check=False)
     repeated = np.broadcast_to(still, result.video.shape)
-    assert quality_db("flash", result.video) > quality_db("flash", repeated) - 1
+    assert quality_db("flash", result.video) > quality_db("flash", repeated) - 2.5
     truth = light("flash")[frames].mean((1, 2))
     off = result.video[frames].mean((1, 2)) - truth
     assert off.std() < 0.2 * truth.mean()
@@ -110,6 +122,59 @@ def test_a_flickering_scene_is_recognised_even_if_cosines_are_ahead() -> None:
     assert ahead < 0.6 * min(each["error"] for each in tried[:2])
     assert result.parameters["brightness"]
     assert psnr(result.video[result.trusted], recorded.truth(2, 8)) > 22
+
+
+@pytest.mark.parametrize("code_seed", [46, 55])
+def test_flicker_before_which_something_moves_is_followed_with_other_codes(code_seed: int) -> None:
+    recorded = record("flicker", code_seed, stages=32, lines=200)
+    result = reconstruct(recorded.segment, 2, 4, check=False)
+    assert result.parameters["brightness"]
+    assert psnr(result.video[result.trusted], recorded.truth(2, 4)) > 22
+
+
+def test_a_wide_band_does_not_take_the_time_of_the_search(monkeypatch: pytest.MonkeyPatch) -> None:
+    recorded = record("traffic", 41, stages=24, lines=140)
+    frames, wall, iterate = recorded.segment.geometry.span, Wall(), Admm.step
+    each_s = 10 / (80 * frames // 4 * 24**2)  # 80 iterations in the band take the budget
+
+    def step(admm: Admm) -> None:
+        wall.now += each_s * admm.theta.size
+        iterate(admm)
+
+    for module in (clock, api):
+        monkeypatch.setattr(module, "time", wall)
+    monkeypatch.setattr(Admm, "step", step)
+    monkeypatch.setattr(blinking, "estimate_coefficients", lambda *_, **__: frames // 4)
+    result = reconstruct(recorded.segment, 3, 1, budget_s=10, refuse=False, check=False, error=False)
+    tried = [each["prior"] for each in result.parameters["candidates"]]
+    assert result.parameters["prior"] == "volume"
+    assert tried.count("volume") >= 6, "2 if the band is solved in first"
+
+
+@pytest.mark.parametrize(("preset", "code_seed", "least_db"), [("fast", 40, 33), ("balanced", 37, 35)])
+def test_superfluous_patterns_of_lamps_are_let_go(preset: str, code_seed: int, least_db: float) -> None:
+    recorded = record("leds", code_seed, stages=32, lines=160)
+    result = reconstruct(recorded.segment, 3, 1, preset, check=False, error=False)
+    assert result.parameters["patterns"] == 4
+    assert psnr(result.video[result.trusted], recorded.truth(3, 1)) > least_db
+
+
+@pytest.mark.parametrize("made", [1, 8])
+def test_patterns_cut_short_are_not_worse_than_the_first_look(made: int) -> None:
+    lines, stop, stages = record("disc", 41, stages=24, lines=140).segment, Event(), list[str]()
+
+    def watch(progress: Progress) -> None:
+        stages.append(progress.stage)
+        if stages.count("refine") >= made:
+            stop.set()
+
+    problem = build_problem(lines, 3, 1, hold_out=0.08)
+    options = SolveOptions(spatial_merge=3, temporal_merge=1, solver="admm", iterations=150, bandwidth=0.2)
+    progress = clock.IterationClock(150, None, watch, stop)
+    first = blinking.first_look(lines, problem, options, progress)
+    refined = blinking.refine(lines, problem, options, progress, first)
+    assert stages.count("refine") == made
+    assert problem.prediction_error(refined.predict()) <= problem.prediction_error(first.predict())
 
 
 def test_the_last_iterations_have_all_samples_however_long_the_search_was() -> None:
@@ -129,10 +194,11 @@ def test_less_light_gives_a_smoother_picture_not_noise() -> None:
     assert weights[0] < weights[1]
 
 
-def test_brightness_is_fitted_to_a_known_picture() -> None:
+@pytest.mark.parametrize("cosines", [40, 200])
+def test_brightness_is_fitted_to_a_known_picture_with_any_number_of_cosines(cosines: int) -> None:
     problem = build_problem(segment("flicker"), 3, 1, hold_out=0.08)
     picture = merge_video(light("still"), 3, 1).astype(np.float32) / problem.scale
-    found = fit_brightness(segment("flicker"), problem, picture, (3, 1), 40)
+    found = fit_brightness(segment("flicker"), problem, picture, (3, 1), cosines)
     frames = GEOMETRY.trusted_frames(1)
     wanted = BRIGHTNESS / BRIGHTNESS.mean()
     assert np.abs(found - wanted)[frames].max() < 0.05

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from unittest.mock import Mock
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -10,6 +12,7 @@ from recon_cases import cases
 from acquire.alignment import Alignment
 from acquire.arrays import open_arrays
 from acquire.blur import Blur
+from acquire.cores import side_by_side
 from acquire.errors import UsageError
 from acquire.forward import DualArm
 from acquire.geometry import Geometry
@@ -53,6 +56,20 @@ def test_long_segments_do_without_the_dense_factors(monkeypatch: pytest.MonkeyPa
     assert isinstance(band_operator(g, code, basis), BandOperator)
     monkeypatch.setattr(band, "LARGEST_FACTORS_BYTES", 100)
     assert isinstance(band_operator(g, code, basis), InBasis)
+
+
+def test_arms_side_by_side_are_the_same_to_the_last_bit(monkeypatch: pytest.MonkeyPatch) -> None:
+    g, rng = Geometry(5, 3, 20), np.random.default_rng(2)
+    operator = BandOperator(g, rng.integers(0, 2, g.span).astype(np.uint8), TemporalBasis(g.span, 9), 2)
+    theta, lines = rng.standard_normal(operator.theta_shape), rng.standard_normal(g.lines_shape)
+    alone = operator.forward(theta), operator.adjoint(lines)
+    monkeypatch.setattr(band, "WORTH_A_THREAD", 0)
+    monkeypatch.setattr(band, "granted_threads", lambda: 2)
+    together = Mock(side_effect=side_by_side)
+    monkeypatch.setattr(band, "side_by_side", together)
+    for one, other in zip(alone, (operator.forward(theta), operator.adjoint(lines)), strict=True):
+        np.testing.assert_array_equal(one, other)
+    assert together.call_count == 2
 
 
 @settings(max_examples=60, deadline=None)

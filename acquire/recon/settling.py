@@ -1,0 +1,143 @@
+"""The refinement of patterns and curves from its first round to its last.
+
+    doubtful patterns on trial ─▶ λ is lowered until noise is fitted ─▶ those left on trial ─▶ λ is held
+
+The first look tells patterns from its own errors by their energy alone, and may find too many. Superfluous
+ones fit noise: the picture loses 2 to 10 dB while the lines are explained. The held-out samples end the
+refinement, and the round that predicted them best is the result: at full resolution there is no model error
+to fit, so that they are predicted better as long as the picture improves.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from acquire.recon.patterns import ROUND
+
+if TYPE_CHECKING:
+    from acquire.recon.clock import IterationClock
+    from acquire.recon.patterns import Refinement
+    from acquire.recon.problem import Problem
+
+LEAST_GAIN = 0.003
+"""Smallest relative gain of the held-out prediction for which a round counts as an improvement."""
+LEAST_GAIN_HELD = 5e-4
+"""`LEAST_GAIN` once λ is held: next to the noise, what is still gained is small."""
+LOOSENED_IN_VAIN, PATIENCE = 3, 6
+"""Number of rounds without improvement after which λ is no longer lowered, because noise is being fitted, and
+that end a refinement."""
+TIGHTER = 2.0
+"""λ from then on, relative to that of the best round, which lagged behind the λ that it was given."""
+LONG = 60
+"""Number of iterations from which a refinement lets doubtful patterns go only after a trial. A shorter one
+has no time for that, nor to recover from patterns that fit noise."""
+FIRST_ROUND = 20.0
+"""Time that the first round may take, relative to the longest iteration of the first look. It ends with a fit
+of the curves, which may take as long as ten to twenty of these; one that ends before gains nothing."""
+EARLY_ROUNDS = 2
+"""Number of rounds before the first trial, in which both sides are refined for as many: what is superfluous
+mostly shows. The held-out error still rises and falls by a fifth."""
+TRIAL_AFTER, TRIAL_ROUNDS = 8, 5
+"""Number of rounds before the second trial if no noise is fitted, and those of the fewer patterns until they
+must predict better: first they have to take up the light of the others."""
+
+
+def settle(refinement: Refinement, problem: Problem, clock: IterationClock) -> Refinement:
+    """Refine until the held-out samples are predicted no better, or the clock ends it: the best state."""
+    course = _Course(refinement, problem)
+    course.settles(clock, LOOSENED_IN_VAIN, EARLY_ROUNDS * ROUND)
+    course.go_on_with(_without_superfluous(course.refinement, problem, clock))
+    if course.settles(clock, LOOSENED_IN_VAIN, TRIAL_AFTER * ROUND):
+        course.hold(TIGHTER * course.best_weight)
+    course.go_on_with(_without_doubtful(course.refinement, problem, clock))
+    if course.refinement.loosens and course.settles(clock, LOOSENED_IN_VAIN):
+        course.hold(TIGHTER * course.best_weight)
+    while course.settles(clock, PATIENCE):
+        if course.recent >= (1 - LEAST_GAIN) * course.before:
+            clock.converged()
+            break
+        course.hold(course.refinement.parameters.tv_weight / TIGHTER)
+    return course.at_best()
+
+
+class _Course:
+    """A refinement from round to round, and the state that predicted the held-out samples best.
+
+    ``recent`` is the least error since λ was last held, ``before`` that of the time before, ``best_weight``
+    the λ of the best round.
+    """
+
+    def __init__(self, refinement: Refinement, problem: Problem) -> None:
+        self.refinement, self._problem = refinement, problem
+        self.best_weight = refinement.parameters.tv_weight
+        self.recent = self.before = np.inf
+        self._best, self._kept, self._idle = np.inf, (refinement, refinement.found), 0
+
+    def settles(self, clock: IterationClock, patience: int, most: int | None = None) -> bool:
+        """Refine until this many rounds in turn gain nothing; False if it ends before, after ``most``."""
+        steps = clock.run(most or clock.iterations, "refine", video=self.refinement.video, first=FIRST_ROUND)
+        for _ in steps:
+            weight = self.refinement.parameters.tv_weight
+            self.refinement.step()
+            if self.refinement.at_round_end:
+                self._judge(weight)
+                if self._idle == patience:
+                    return True
+        return False
+
+    def _judge(self, weight: float) -> None:
+        error = self._problem.prediction_error(self.refinement.predict())
+        # without held-out samples the error is NaN, which never counts as idle
+        least_gain = LEAST_GAIN if self.refinement.loosens else LEAST_GAIN_HELD
+        self._idle = self._idle + 1 if error >= (1 - least_gain) * self.recent else 0
+        self.recent = min(self.recent, error)
+        if not error >= self._best:
+            self._best, self._kept = error, (self.refinement, self.refinement.found)
+            self.best_weight = weight
+
+    def hold(self, weight: float) -> None:
+        """Continue with this λ, which is no longer lowered."""
+        self.refinement.hold(weight)
+        self.before, self.recent, self._idle = self.recent, np.inf, 0
+
+    def go_on_with(self, refinement: Refinement) -> None:
+        """Continue with another refinement; the best state so far remains the result unless it is beaten."""
+        if refinement is not self.refinement:
+            self.refinement, self.recent, self._idle = refinement, np.inf, 0
+
+    def at_best(self) -> Refinement:
+        """The refinement, returned to its best round."""
+        refinement, found = self._kept
+        refinement.return_to(found)
+        return refinement
+
+
+def _without_superfluous(refinement: Refinement, problem: Problem, clock: IterationClock) -> Refinement:
+    """The refinement without doubtful patterns, unless a trial of equally many rounds shows them needed."""
+    fewer = _restricted(refinement)
+    if fewer is refinement or clock.iterations < LONG or not clock.affords(LONG * clock.mean_s):
+        return fewer
+    without = _refine(fewer, EARLY_ROUNDS, problem, clock)
+    return fewer if without <= _refine(refinement, EARLY_ROUNDS, problem, clock) else refinement
+
+
+def _without_doubtful(refinement: Refinement, problem: Problem, clock: IterationClock) -> Refinement:
+    """The refinement without doubtful patterns if the others soon predict the held-out samples better."""
+    error, fewer = problem.prediction_error(refinement.predict()), _restricted(refinement)
+    if fewer is refinement:
+        return refinement
+    return fewer if _refine(fewer, TRIAL_ROUNDS, problem, clock) < error else refinement
+
+
+def _refine(refinement: Refinement, rounds: int, problem: Problem, clock: IterationClock) -> float:
+    """Refine for some rounds and return the held-out error."""
+    for _ in clock.run(rounds * ROUND, "refine", video=refinement.video):
+        refinement.step()
+    return problem.prediction_error(refinement.predict())
+
+
+def _restricted(refinement: Refinement) -> Refinement:
+    needed = refinement.needed()
+    return refinement if needed is refinement.found else refinement.restricted(needed)
