@@ -157,7 +157,8 @@ def study(bench: Bench, code: Code, lines: int = STUDIED_LINES) -> Study:
     full = _sample(bench, code, lines)
     again = _sample(replace(bench, realisation=bench.realisation + 1), code, lines)
     quiet = _sample(bench.without(*TEMPORAL_NOISE), code, lines)
-    noise_dn = float(np.sqrt(np.mean((full - again) ** 2) / 2 + QUANTISATION_DN2))
+    # The lines are rounded: their difference includes the rounding, unless it is all there is.
+    noise_dn = float(np.sqrt(max(float(np.mean((full - again) ** 2)) / 2, QUANTISATION_DN2)))
     worths = []
     for effect in kinds:
         if effect in TEMPORAL_NOISE:

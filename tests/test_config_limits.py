@@ -7,8 +7,9 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from pydantic import ValidationError
 
-from acquire.config import RigConfig, builtin_directory, load_plan, load_rig, load_scene
+from acquire.config import RigConfig, builtin_directory, load_plan, load_recorded, load_rig, load_scene
 from acquire.config.files import MOST_FILE_BYTES, parse_settings
 from acquire.daemon import host
 from acquire.daemon.host import check_host
@@ -76,6 +77,31 @@ def test_more_tags_than_the_host_can_read_are_refused() -> None:
     assert load_rig("rig-demo", settings | {"trigger.tag_every_lines": 4}).trigger.tag_every_lines == 4
     with pytest.raises(ConfigError, match=r"cannot be 4 at 66666\.7 lines/s"):
         load_rig("rig-demo", settings | {"trigger.tag_every_lines": 4, "simulation.speed": 2.0})
+
+
+@pytest.mark.parametrize(
+    "broken",
+    [
+        {"trigger": {"tag_every_lines": 1}},
+        {"stream": {"block_lines": 65_536}},
+        {"stream": {"ring_slots": 2, "ring_seconds": None}},
+        {"events": {"pre_s": 60.0, "sources": ["input"]}},
+    ],
+)
+def test_limits_of_a_live_capture_do_not_apply_to_the_rig_of_a_recording(
+    broken: dict[str, dict[str, object]],
+) -> None:
+    table = load_rig("rig-demo").model_dump(mode="json")
+    for name, changes in broken.items():
+        table[name] |= changes
+    with pytest.raises(ValidationError, match=r"cannot be|need"):
+        RigConfig.model_validate(table)
+    attrs = {"config": table, "scene": load_scene("scene-leds").model_dump(mode="json")}
+    rig, _ = load_recorded(attrs, "r.zarr")
+    assert rig.geometry == load_rig("rig-demo").geometry
+    table["fibre"] = {"rows": 64, "columns": 64, "sensor_pixels": 64}
+    with pytest.raises(ConfigError, match=r"r\.zarr, as it was recorded"):
+        load_recorded(attrs, "r.zarr")
 
 
 def test_special_files_are_not_read(tmp_path: Path) -> None:

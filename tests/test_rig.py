@@ -199,6 +199,13 @@ def test_a_scene_that_cannot_be_shown_is_refused_before_anything_is_made(config,
     assert open_descriptors() == before
 
 
+def test_a_scene_that_the_light_cannot_serve_is_refused_before_a_camera_is_opened():
+    """It would otherwise be refused in a camera's process, at the first line."""
+    scene = {"simulation.scene": "scene-leds-measured", "trigger.light.close_ticks": 450}
+    with pytest.raises(UsageError, match="light that is on for only part of each sub-step"):
+        Rig(load_rig("rig-demo.toml", OVERRIDES | scene))
+
+
 def test_devices_deliver_what_simulate_writes_effects_layout_losses_and_all(config, tmp_path):
     scene = load_scene("scene-leds-measured").model_dump(mode="json")
     scene["effects"].append({"kind": "dropped_lines", "rate": 0.03})

@@ -134,6 +134,16 @@ def test_the_study_ranks_effects_by_their_influence():
     assert study(bench_of(RIG, LEDS), RIG.code.build()).effects == ()
 
 
+@pytest.mark.parametrize("sigma_dn", [0.0, 0.5, 3.0])
+def test_the_noise_of_a_study_counts_rounding_once(sigma_dn):
+    noise = [{"kind": "read_noise", "sigma_e": sigma_dn / LEDS.system_gain_dn_per_e}] if sigma_dn else []
+    camera = RIG.cameras.a.model_copy(update={"black_level_dn": 100.0})
+    cameras = RIG.cameras.model_copy(update={"a": camera, "b": camera})
+    bench = bench_of(RIG.model_copy(update={"cameras": cameras}), listed(*noise))
+    found = study(bench, RIG.code.build(), 4096)
+    assert found.noise_dn == pytest.approx(np.sqrt(sigma_dn**2 + 1 / 12), rel=0.03)
+
+
 def acquire(*words):
     return subprocess.run(
         [sys.executable, "-m", "acquire", "simulate", *map(str, words)],

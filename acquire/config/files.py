@@ -12,7 +12,7 @@ from pydantic import BaseModel, ValidationError
 
 from acquire.config.findings import explained
 from acquire.config.plan import ReconstructionPlan
-from acquire.config.rig import RigConfig
+from acquire.config.rig import RECORDED, RigConfig
 from acquire.config.scene import SceneFile
 from acquire.errors import ConfigError
 from acquire.place import builtin_directory, builtin_names
@@ -138,10 +138,12 @@ def load_scene(name: str | Path) -> SceneBase:
 def load_recorded(attrs: Mapping[str, Any], origin: str | Path) -> tuple[RigConfig, SceneBase]:
     """Return the rig and the scene that a recording was simulated with; errors name ``origin``.
 
+    The rig need not be able to capture here and now: older versions had other limits.
     Raises ConfigError if they need a plug-in that is not installed here.
     """
     where = f"{origin}, as it was recorded"
-    return _validate(RigConfig, attrs["config"], where), _validate(SceneFile, attrs["scene"], where).root
+    rig = _validate(RigConfig, attrs["config"], where, RECORDED)
+    return rig, _validate(SceneFile, attrs["scene"], where).root
 
 
 def load_plan(name: str | Path) -> ReconstructionPlan:
@@ -193,8 +195,10 @@ def _set(table: dict[str, Any], dotted: str, value: Any) -> None:
     table[last] = value
 
 
-def _validate(model: type[M], table: dict[str, Any], path: Path | str) -> M:
+def _validate(
+    model: type[M], table: dict[str, Any], path: Path | str, context: Mapping[str, Any] | None = None
+) -> M:
     try:
-        return model.model_validate(table)
+        return model.model_validate(table, context=context)
     except ValidationError as error:
         raise ConfigError(explained(error, model, path)) from error

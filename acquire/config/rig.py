@@ -6,7 +6,7 @@ import math
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
-from pydantic import BeforeValidator, Field, model_validator
+from pydantic import BeforeValidator, Field, ValidationInfo, model_validator
 
 from acquire.codes import TAPS, Code, ConstantCode, PrbsCode
 from acquire.config.base import MOST_SECONDS, SEED_END, FilePath, FrozenModel
@@ -32,6 +32,8 @@ WHOLE_STEPS = ("VT-4K5C-H100",)
 """Camera models that are known to have no intra-line charge transfer."""
 MAX_RING_BYTES = 4 * 2**30
 """Largest ring of one arm."""
+RECORDED = {"recorded": True}
+"""Context in which the rig of a recording is validated: limits of the capture path do not apply to it."""
 MOST_TAGS_PER_S = 10_000
 """A free processor reads three times as many. To a host that lags behind, the trigger seems to be late."""
 
@@ -139,6 +141,11 @@ class SimulationConfig(FrozenModel):
     )
 
 
+def _is_recorded(info: ValidationInfo) -> bool:
+    """Whether the rig is that of a recording, whose lines are only read."""
+    return bool(info.context and info.context.get("recorded"))
+
+
 def _default_to_prbs(value: Any) -> Any:
     """Make ``[code]`` without a ``kind`` pseudo-random, as it is in a rig without ``[code]``."""
     return {"kind": "prbs", **value} if isinstance(value, dict) else value
@@ -193,11 +200,13 @@ class RigConfig(FrozenModel):
         return self
 
     @model_validator(mode="after")
-    def _ring_fits(self) -> RigConfig:
+    def _ring_fits(self, info: ValidationInfo) -> RigConfig:
         """Lines wait in the ring for their tag until half of it is full.
 
         Tags every third of the ring leave a sixth of it for a tag that is late on a busy host.
         """
+        if _is_recorded(info):
+            return self
         lines = self.ring_slots * self.stream.block_lines
         pixel_bytes = 1 if self.cameras.a.dtype == "uint8" else 2
         if (size := lines * self.pixels * pixel_bytes) > MAX_RING_BYTES:
@@ -213,8 +222,10 @@ class RigConfig(FrozenModel):
         return self
 
     @model_validator(mode="after")
-    def _blocks_come_before_a_stall(self) -> RigConfig:
+    def _blocks_come_before_a_stall(self, info: ValidationInfo) -> RigConfig:
         """A camera delivers whole blocks: until one is full, its arm is silent."""
+        if _is_recorded(info):
+            return self
         passing_hz, most_s = self.line_rate_hz * self.simulation.speed, self.stall_timeout_s / 2
         if (block_s := self.stream.block_lines / passing_hz) > most_s:
             raise ValueError(
@@ -225,7 +236,9 @@ class RigConfig(FrozenModel):
         return self
 
     @model_validator(mode="after")
-    def _tags_can_be_read(self) -> RigConfig:
+    def _tags_can_be_read(self, info: ValidationInfo) -> RigConfig:
+        if _is_recorded(info):
+            return self
         passing_hz = self.line_rate_hz * self.simulation.speed
         fewest = math.ceil(passing_hz / MOST_TAGS_PER_S)
         if self.trigger.tag_every_lines < fewest:
@@ -254,8 +267,10 @@ class RigConfig(FrozenModel):
         return self
 
     @model_validator(mode="after")
-    def _past_fits(self) -> RigConfig:
+    def _past_fits(self, info: ValidationInfo) -> RigConfig:
         """The ring keeps filling while an event is detected and its recording is created."""
+        if _is_recorded(info):
+            return self
         longest_s = self.history_s - EVENT_DELAY_S * self.simulation.speed
         if self.events.sources and self.events.pre_s > longest_s:
             raise ValueError(

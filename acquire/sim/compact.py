@@ -28,12 +28,16 @@ class SideBySideOpener:
 
 
 class SideBySide:
-    """One camera made of several that follow the same pulses; columns without an image are dark."""
+    """One camera made of several that follow the same pulses; columns without an image are dark.
+
+    A sensor loses whole lines: one that any of the parts has lost is not delivered.
+    """
 
     def __init__(self, opener: SideBySideOpener) -> None:
         self._opener = opener
         self._parts: list[SimulatedCamera] = [part() for part in opener.openers]
-        self._ready: list[CameraBlock] = []
+        self._waiting: list[CameraBlock | None] = [None] * len(self._parts)
+        self._end = self._delivered = 0
 
     def identify(self) -> CameraIdentity:
         return self._parts[0].identify()
@@ -42,26 +46,42 @@ class SideBySide:
         return self._parts[0].settings() | {"Width": self._opener.width, "SensorWidth": self._opener.width}
 
     def arm(self) -> None:
-        self._ready.clear()
+        self._waiting = [None] * len(self._parts)
+        self._end = self._delivered = 0
         first, *others = self._parts
         first.arm()
         for part in others:
             part.arm_like(first)
 
     def next_block(self, timeout_s: float) -> CameraBlock | None:
-        """Return a block once every part has delivered its own; it is as long as the first part's."""
-        # A block that arrived before a timeout of another part is kept for the next call.
-        for part in self._parts[len(self._ready) :]:
-            block = part.next_block(timeout_s)
-            if block is None:
+        """Return the next lines that every part has delivered."""
+        while (blocks := self._blocks(timeout_s)) is not None:
+            first = max(block.first_line for block in blocks)
+            end = min(block.first_line + len(block.flags) for block in blocks)
+            self._waiting = [_from(block, end) for block in blocks]
+            if first < end:
+                return self._joined(blocks, first, end - first)
+        return None
+
+    def _blocks(self, timeout_s: float) -> list[CameraBlock] | None:
+        """Return a block of every part; None if one has none yet, and those of the others are kept."""
+        for number, part in enumerate(self._parts):
+            if self._waiting[number] is None:
+                self._waiting[number] = part.next_block(timeout_s)
+            if self._waiting[number] is None:
                 return None
-            self._ready.append(block)
-        blocks, self._ready = self._ready, []
-        count = len(blocks[0].flags)
+        return [block for block in self._waiting if block is not None]
+
+    def _joined(self, blocks: list[CameraBlock], first_line: int, count: int) -> CameraBlock:
+        """Return lines that are in all blocks side by side."""
+        self._delivered, self._end = self._delivered + count, first_line + count
         pixels: NDArray[Any] = np.zeros((count, self._opener.width), blocks[0].pixels.dtype)
-        for first, block in zip(self._opener.first_columns, blocks, strict=True):
-            pixels[:, first : first + block.pixels.shape[1]] = block.pixels[:count]
-        return CameraBlock(blocks[0].first_line, pixels, blocks[0].flags)
+        flags = np.zeros(count, np.uint16)
+        for column, block in zip(self._opener.first_columns, blocks, strict=True):
+            skip = first_line - block.first_line
+            pixels[:, column : column + block.pixels.shape[1]] = block.pixels[skip : skip + count]
+            flags |= block.flags[skip : skip + count]
+        return CameraBlock(first_line, pixels, flags)
 
     def times_ns(self, first_line: int, count: int) -> NDArray[np.int64]:
         return self._parts[0].times_ns(first_line, count)
@@ -74,8 +94,17 @@ class SideBySide:
             part.disarm()
 
     def statistics(self) -> dict[str, int]:
-        return self._parts[0].statistics()
+        behind = max(part.statistics()["behind_lines"] for part in self._parts)
+        return {"lines": self._delivered, "lost": self._end - self._delivered, "behind_lines": behind}
 
     def close(self) -> None:
         for part in self._parts:
             part.close()
+
+
+def _from(block: CameraBlock, line: int) -> CameraBlock | None:
+    """Return the part of a block from a line on, None if there is none."""
+    skip = max(0, line - block.first_line)
+    if skip >= len(block.flags):
+        return None
+    return CameraBlock(block.first_line + skip, block.pixels[skip:], block.flags[skip:])

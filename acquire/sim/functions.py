@@ -62,7 +62,9 @@ class FunctionScene:
         """(count, row, column) float32."""
         light = self._function((substeps + 0.5) * self._substep_s, self._row, self._column)
         name = f"function {getattr(self._function, '__name__', repr(self._function))}"
-        return checked_light(light, (len(substeps), self.size, self.size), name)
+        frames = checked_light(light, (len(substeps), self.size, self.size), name)
+        # A shutter covers frames in place, and the function may have returned an array that it keeps.
+        return frames.copy()
 
 
 def checked_light(light: Any, shape: tuple[int, ...], what: str) -> NDArray[np.float32]:

@@ -98,7 +98,15 @@ class SimulatedDevices:
             # Each camera is built once here, so that UsageError is not raised in a camera's process.
             substep_s = config.trigger.substep_ticks / config.trigger.clock_hz
             cameras = {arm: config.cameras.arm(arm) for arm in ARMS}
-            bench = Bench(scene, config.geometry, cameras, substep_s, fibre=config.laid_out)
+            bench = Bench(
+                scene,
+                config.geometry,
+                cameras,
+                substep_s,
+                settled_s=config.trigger.settled_s,
+                lit_part=config.trigger.lit_part,
+                fibre=config.laid_out,
+            )
             for arm in ARMS:
                 bench.camera(arm, ConstantCode(0))
             self._scene, self._scene_version = scene, version

@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from numpy.typing import NDArray
+    from PIL.Image import Image
 
     Light = NDArray[np.floating[Any]]
 
@@ -221,7 +222,12 @@ class _ArrayFile:
 
 
 class _PictureFile:
-    """A file that Pillow reads. Its last frame is decoded at once, to refuse damaged files early."""
+    """A file that Pillow reads. Its last frame is decoded at once, to refuse damaged files early.
+
+    An animation's rate is the mean over its frames, which may have different durations.
+    """
+
+    frame_rate_hz: float | None = None
 
     def __init__(self, path: Path) -> None:
         from PIL import Image
@@ -232,8 +238,8 @@ class _PictureFile:
             self.count = int(getattr(image, "n_frames", 1))
             image.seek(self.count - 1)
             image.load()
-            duration_ms = float(image.info.get("duration") or 0)
-        self.frame_rate_hz = 1000 / duration_ms if duration_ms > 0 else None
+            if "duration" in image.info:
+                self.frame_rate_hz = _mean_rate_hz(image, self.count)
 
     def frame(self, index: int) -> Light:
         from PIL import Image
@@ -248,6 +254,16 @@ class _PictureFile:
                 return _grey(image.convert("L"))
         except (OSError, SyntaxError, ValueError, EOFError) as error:
             raise DataError(f"{self._path}: frame {index} cannot be read: {error}") from error
+
+
+def _mean_rate_hz(image: Image, count: int) -> float | None:
+    """Return the frames of an animation per second of its duration; None if it states none."""
+    total_ms = 0.0
+    for index in range(count):
+        image.seek(index)
+        image.load()  # some formats state a frame's duration only once it is decoded
+        total_ms += float(image.info.get("duration") or 0)
+    return 1000 * count / total_ms if total_ms > 0 else None
 
 
 def _grey(levels: Any) -> Light:

@@ -126,6 +126,11 @@ class Bench:
         factor = self.scene.optics.baseline_factor
         return build_scene(self.scene, size * factor, self.substep_s / factor)
 
+    def summed_scene(self) -> Scene:
+        """Return the light that Eq. (1) sums, in the pixels and sub-steps of a reconstruction."""
+        scene, optics = self.fine_scene(), self.scene.optics
+        return scene if optics.layout != "interline" else binned(scene, optics.baseline_factor)
+
 
 class Camera(ABC):
     """The source of one arm's lines; see `Bench.camera`."""

@@ -34,7 +34,10 @@ class Scene(Protocol):
     def size(self) -> int: ...
 
     def frames(self, first: int, count: int) -> NDArray[np.float32]:
-        """Return the mean light of sub-steps ``first .. first + count - 1``: (count, row, column)."""
+        """Return the mean light of sub-steps ``first .. first + count - 1``: (count, row, column).
+
+        The array is a new one, which the caller may change.
+        """
         ...
 
 

@@ -24,10 +24,14 @@ from sim_helpers import (
 )
 
 from acquire.codes import ConstantCode
+from acquire.config import GeometryConfig
 from acquire.config.device import TriggerConfig
 from acquire.errors import CameraError
 from acquire.sim.clock import Wire
-from acquire.sim.devices import SimulatedCamera, SimulatedCameraOpener
+from acquire.sim.compact import SideBySideOpener
+from acquire.sim.devices import SimulatedCamera, SimulatedCameraOpener, SimulatedOptics
+from acquire.sim.effects.stream import DroppedLines
+from acquire.sim.pipeline import Bench
 from acquire.sim.scenes import build_scene
 from acquire.sim.trigger_model import TriggerModel
 from acquire.sim.twin_links import TwinTransport
@@ -164,6 +168,35 @@ def test_the_converter_rounds_and_clips(wire, clock, trigger, pixel_format, whit
     dn = np.concatenate(read_lines(eye, 40))
     assert dn.dtype == dtype
     assert (dn.min(), dn.max()) == (5, white)
+
+
+def test_arms_side_by_side_stay_on_the_same_line_when_lines_are_lost(wire, clock, trigger):
+    scene = LEDS.model_copy(update={"effects": (DroppedLines(kind="dropped_lines", rate=0.03),)})
+    geometry = GeometryConfig(stages=M, substeps=S)
+    openers = tuple(
+        SimulatedCameraOpener(wire, SimulatedOptics(arm, geometry, scene), camera_config(), 64, LINE_RATE_HZ)
+        for arm in "ab"
+    )
+    one = SideBySideOpener(openers, (1, 6), 11)()
+    one.arm()
+    trigger.start()
+    clock.now_ns += 1000 * LINE_NS
+    pulses = trigger.stop()
+    seen = {}
+    for _ in range(200):
+        if (block := one.next_block(0.01)) is not None:
+            assert not block.pixels[:, [0, 5, 10]].any()
+            assert block.first_line > max(seen, default=-1)
+            seen |= dict(enumerate(block.pixels, block.first_line))
+    bench = Bench(scene, geometry, dict.fromkeys("ab", camera_config()), 1e-5)
+    a, b = (bench.camera(arm, CODE).read(-DEPTH, pulses) for arm in "ab")
+    kept = np.flatnonzero(~(a.missing | b.missing))
+    assert 900 < len(kept) < 980
+    np.testing.assert_array_equal(list(seen), kept)
+    lines = np.stack(list(seen.values()))
+    np.testing.assert_array_equal(lines[:, 1:5], a.pixels[kept])
+    np.testing.assert_array_equal(lines[:, 6:10], b.pixels[kept])
+    assert one.statistics() == {"lines": len(kept), "lost": kept[-1] + 1 - len(kept), "behind_lines": 0}
 
 
 def test_a_camera_armed_while_pulses_come_counts_from_there(wire, clock, trigger):

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from effect_cases import FLAT, effects
 from sim_helpers import CODE
-from small_bench import DT, LIT, N, bench, blinking, flat, read
+from small_bench import DT, LIT, M, N, S, bench, blinking, flat, read
 
 from acquire.codes import ConstantCode
+from acquire.config import GeometryConfig
 from acquire.sim.functions import FunctionSceneConfig
 from acquire.sim.leds import LedSceneConfig
 from acquire.sim.scenes import build_scene
@@ -126,6 +128,18 @@ def test_a_veil_spreads_light_evenly_and_ambient_light_is_in_every_line():
     assert image[0, 0] == pytest.approx(0.05 / N**2)
     dark = read(flat(0.0, effects("stray_light", veil=0.0, ambient=0.5)), code=ConstantCode(0)).pixels
     assert (dark == 300 + 0.5 * FLAT).all()
+
+
+@pytest.mark.parametrize("layout", ["dual", "emulated", "interline"])
+def test_ambient_light_is_in_units_of_the_scenes_light_in_every_layout(layout):
+    stray = effects("stray_light", veil=0.0, ambient=1.0)
+    optics = {"layout": layout, "baseline_factor": 3}
+    geometry = GeometryConfig(stages=M, substeps=1 if layout == "interline" else S)
+    ambient, lit = (
+        replace(bench(scene), geometry=geometry).camera("a", ConstantCode(code)).read(100, 2).pixels
+        for scene, code in ((flat(0.0, stray, optics=optics), 0), (flat(1.0, optics=optics), 1))
+    )
+    np.testing.assert_array_equal(ambient, lit)
 
 
 def test_images_of_masks_and_of_frames_agree():

@@ -134,6 +134,14 @@ def test_prnu_and_dsnu_are_fixed_patterns_of_their_size():
     assert np.ptp(lines, axis=0).max() == 0 < np.ptp(lines[0])
 
 
+def test_no_pixel_answers_light_with_a_negative_signal():
+    dark, lit = (read(flat(level, effects("prnu", prnu=1.0)), 1).pixels for level in (0.0, 1.0))
+    many = [read(flat(1.0, effects("prnu", prnu=1.0), seed=seed), 1).pixels for seed in range(20)]
+    assert (dark == 300).all()
+    assert lit.min() >= 300
+    assert np.min(many) == 300
+
+
 def test_a_full_well_limits_the_electrons():
     assert electrons(flat(1.0, effects("full_well"))).max() == pytest.approx(600.0)
     np.testing.assert_array_equal(read(flat(0.1, effects("full_well"))).pixels, read(flat(0.1)).pixels)

@@ -8,6 +8,7 @@ import pytest
 from PIL import Image
 
 from acquire.config import load_scene
+from acquire.config.scene import SceneFile
 from acquire.errors import DataError, UsageError
 from acquire.sim.media import _KEPT_FRAMES, VideoScene, VideoSceneConfig, resample
 from acquire.sim.scenes import build_scene
@@ -149,6 +150,29 @@ def test_a_users_function_in_a_file_next_to_the_scene(tmp_path):
             build_scene(load_scene(scene_file), 5, 1e-4)
 
 
+@pytest.mark.parametrize(
+    "shutter",
+    [
+        {"kind": "window", "phases": [{"duration_s": 1.0, "axis": "row", "end": 1.0, "width": 0.2}]},
+        {"kind": "chopper", "rotation_hz": 100.0},
+    ],
+)
+def test_a_shutter_leaves_an_array_that_a_function_keeps_as_it_is(tmp_path, shutter):
+    (tmp_path / "kept.py").write_text(
+        "import numpy as np\n"
+        "PICTURE = np.ones((12, 12), np.float32)\n"
+        "VIDEO = np.ones((4, 12, 12), np.float32)\n"
+        "def picture(t, row, column):\n    return np.broadcast_to(PICTURE, (len(t), 12, 12))\n"
+        "def video(t, row, column):\n    return VIDEO[:len(t)]\n"
+    )
+    for name in ("picture", "video"):
+        table = {"kind": "function", "function": f"{tmp_path}/kept.py:{name}", "shutters": [shutter]}
+        scene = build_scene(SceneFile.model_validate(table).root, 12, 1e-3)
+        before = scene.frames(0, 4)
+        assert 0 < scene.frames(300, 4).mean() < 1
+        np.testing.assert_array_equal(scene.frames(0, 4), before)
+
+
 def test_a_users_picture_moves(tmp_path):
     Image.fromarray(np.full((20, 20, 2), 255, np.uint8), "LA").save(tmp_path / "fish.png")
     sprite = SpriteConfig(picture=str(tmp_path / "fish.png"), row=0.5, column=0.25, size=0.4)
@@ -168,6 +192,15 @@ def test_a_truncated_container_ends_with_its_last_frame(tmp_path):
     expected = resample(noise[10].astype(np.float32) / 255, 8)
     np.testing.assert_allclose(scene.frames(10, 1)[0], expected, atol=0.02)
     np.testing.assert_array_equal(*scene.frames(60, 2))
+
+
+@pytest.mark.parametrize("name", ["a.gif", "a.webp", "a.png"])
+def test_frames_of_different_durations_have_their_mean_rate(tmp_path, name):
+    first, *rest = (Image.fromarray(np.full((8, 8), level, np.uint8)) for level in (0, 80, 160, 240))
+    first.save(tmp_path / name, save_all=True, append_images=rest, duration=[100, 100, 100, 500], loop=0)
+    scene = VideoScene(VideoSceneConfig(kind="video", path=tmp_path / name, between="hold"), 8, 0.01)
+    changes = np.flatnonzero(np.diff(scene.frames(0, 80)[:, 0, 0])) + 1
+    np.testing.assert_array_equal(changes, [20, 40, 60])
 
 
 def test_a_frame_that_cannot_be_read_is_named(tmp_path, monkeypatch):

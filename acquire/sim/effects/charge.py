@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 
 class Prnu(Effect):
-    """Photo response non-uniformity: gain 1 + N(0, prnu) per pixel of the line."""
+    """Photo response non-uniformity: gain 1 + N(0, prnu), not below 0, per pixel of the line."""
 
     kind: Literal["prnu"]
     place: ClassVar[Place] = "charge"
@@ -23,8 +23,8 @@ class Prnu(Effect):
     prnu: Positive = Field(le=1, description="PRNU₁₂₈₈ as a fraction of 1")
 
     def stages(self, setting: Setting) -> list[Stage]:
-        """μ_e ← μ_e·(1 + N(0, PRNU₁₂₈₈)), fixed per pixel of the line: TDI averages over the stages."""
-        gain = 1 + self.prnu * pattern("prnu", setting).standard_normal(setting.pixels)
+        """μ_e ← μ_e·max(0, 1 + N(0, PRNU₁₂₈₈)), fixed per pixel of the line: TDI averages over the stages."""
+        gain = np.maximum(1 + self.prnu * pattern("prnu", setting).standard_normal(setting.pixels), 0)
 
         def run(electrons: NDArray[Any], first_line: int) -> NDArray[Any]:  # noqa: ARG001
             return electrons * gain

@@ -94,7 +94,10 @@ class StrayLight(Effect):
     ambient: float = Field(default=0.0, ge=0, description="ambient light in units of the scene's light")
 
     def stages(self, setting: Setting) -> list[Stage]:
-        """Veil v: X ← (1 − v)·X + v·mean(X). Ambient light a: Y ← Y + a·n·S², in every line, coded or not."""
+        """Veil v: X ← (1 − v)·X + v·mean(X). Ambient light a: Y ← Y + a·n·S², in every line, coded or not.
+
+        In front of a baseline's sensor, whose scene is k times as fine, that is a·n·S²·k³.
+        """
         stages = []
         if self.veil:
             veil = np.float32(self.veil)
@@ -107,7 +110,8 @@ class StrayLight(Effect):
             stages.append(Stage("stray_light", "image", run))
         if self.ambient:
             n, S = setting.stages * setting.substeps, setting.substeps
-            steady = self.ambient * n * S**2
+            finer = 1 if setting.fibre is not None else setting.scene.size // n
+            steady = self.ambient * n * S**2 * finer**3
 
             def add(lines: NDArray[Any], first_line: int) -> NDArray[Any]:  # noqa: ARG001
                 return lines + steady

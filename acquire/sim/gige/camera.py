@@ -97,7 +97,7 @@ class GigeCamera:
         self._acquiring = False
         self._frames = 0
         self._sent: deque[tuple[int, list[bytes]]] = deque(maxlen=_KEPT_FRAMES)
-        self._waiting: list[tuple[int, NDArray[Any]]] = []
+        self._waiting: list[tuple[NDArray[np.int64], NDArray[Any]]] = []
 
     def turn(self) -> None:
         """Serve what is due now; wait a moment if there is nothing."""
@@ -105,14 +105,14 @@ class GigeCamera:
         for control in ready:
             self._answer(control)
         if self._acquiring and (block := self._sensor.next_block(_BLOCK_WAIT_S)) is not None:
-            self._waiting.append((block.first_line, np.array(block.pixels)))
+            # Every line with its number: the sensor may have lost lines in between.
+            numbers = block.first_line + np.arange(len(block.pixels))
+            self._waiting.append((numbers, np.array(block.pixels)))
             height = self._register("Height")
             while sum(len(lines) for _, lines in self._waiting) >= height:
-                first_line = self._waiting[0][0]
-                lines = np.concatenate([lines for _, lines in self._waiting])
-                self._send(int(self._sensor.times_ns(first_line, 1)[0]), lines[:height])
-                rest = lines[height:]
-                self._waiting = [(first_line + height, rest)] if len(rest) else []
+                numbers, lines = (np.concatenate(parts) for parts in zip(*self._waiting, strict=True))
+                self._send(int(self._sensor.times_ns(int(numbers[0]), 1)[0]), lines[:height])
+                self._waiting = [(numbers[height:], lines[height:])] if len(lines) > height else []
 
     def _answer(self, control: socket.socket) -> None:
         packet, sender = control.recvfrom(2048)
