@@ -27,6 +27,8 @@ CONSTANT_SWING = 1e-6
 """A curve whose swing is below this share of its largest value is constant, up to rounding of float32."""
 HARMONICS = 3
 """Fundamental, second and third harmonic: a saturating LED turns a sinusoid into these."""
+LOWEST = 0.75
+"""Lower limit of a frequency with overtones, relative to that of the best sinusoid without them."""
 SPECTRUM_PADDING = 8
 """The spectrum is evaluated at 1/8 of its natural spacing, so that the search starts inside the main lobe."""
 
@@ -224,13 +226,21 @@ def _refine(
     lobe_hz = 1 / (len(values) * interval_s)
     low_hz = max(start_hz - lobe_hz, 0.25 * lobe_hz)
     high_hz = min(start_hz + lobe_hz, 0.5 / interval_s)
-    best = minimize_scalar(
-        lambda f: float(np.sum(np.square(_project(values, times_s, f, harmonics)[1]))),
-        bounds=(low_hz, high_hz),
-        method="bounded",
-        options={"xatol": 1e-7 * lobe_hz},
-    )
-    return float(best.x), harmonics
+
+    def best(low_hz: float, high_hz: float, harmonics: int) -> float:
+        found = minimize_scalar(
+            lambda f: float(np.sum(np.square(_project(values, times_s, f, harmonics)[1]))),
+            bounds=(low_hz, high_hz),
+            method="bounded",
+            options={"xatol": 1e-7 * lobe_hz},
+        )
+        return float(found.x)
+
+    if harmonics > 1 and low_hz < LOWEST * start_hz:
+        # Of one or two periods half the frequency is within the lobe, where the second harmonic fits as well
+        # as the fundamental.
+        low_hz = max(low_hz, LOWEST * best(low_hz, high_hz, 1))
+    return best(low_hz, high_hz, harmonics), harmonics
 
 
 def _project(

@@ -113,7 +113,7 @@ class Judge:
         attrs = recording.attrs
         if not attrs.get("simulated") or "scene" not in attrs:
             return cls(segment, None)
-        scene = bench_of(*load_recorded(attrs, str(recording))).fine_scene()
+        scene = bench_of(*load_recorded(attrs, str(recording))).summed_scene()
         if tile is not None and recording.fibre is not None:
             scene = tile_view(scene, recording.fibre, tile)
         return cls(segment, scene)

@@ -88,6 +88,16 @@ class TestFitSine:
         assert fit.distortion == pytest.approx(np.hypot(*series[1:]) / series[0], rel=0.02)
         np.testing.assert_allclose(fit.at(TIMES_S), saturated(hz), atol=0.02)
 
+    @pytest.mark.parametrize("periods", [0.9, 1.0, 1.2, 1.5])
+    @pytest.mark.parametrize("phase", [0.3, 2.0, 4.5])
+    def test_one_period_is_not_taken_for_the_second_harmonic_of_half_the_frequency(
+        self, periods, phase
+    ) -> None:
+        noise = 0.005 * np.random.default_rng(1).standard_normal(FRAMES)
+        for curve in (sine(periods * LOBE_HZ, phase=phase), saturated(periods * LOBE_HZ)):
+            fit = fit_sine(curve + noise, INTERVAL_S, harmonics=3)
+            assert fit.frequency_hz == pytest.approx(periods * LOBE_HZ, rel=0.05)
+
     def test_a_pure_sinusoid_is_not_distorted(self) -> None:
         assert fit_sine(sine(5000), INTERVAL_S, harmonics=3).distortion < 1e-6
 

@@ -46,3 +46,8 @@ def test_dark_lamps_and_wrong_frequencies_are_reported() -> None:
     assert rows["equals: constant"] == "not found"
     assert rows["upper left: none of these"].startswith("3300")
     assert rows["x: 5000 Hz"].endswith("upper right")
+
+
+@pytest.mark.parametrize("light", [0.0, -0.1])
+def test_a_dark_field_has_no_lamps(light: float) -> None:
+    assert list(_lamps(np.full((598, 32, 32), light), INTERVAL_S)) == []

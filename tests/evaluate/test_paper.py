@@ -5,9 +5,15 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from acquire.config import load_rig, load_scene
 from acquire.evaluate.paper.bars import contrasts, last_resolved, place_of
 from acquire.evaluate.paper.comparison import Row, captured, faster, finer, frequency, same
+from acquire.evaluate.paper.fig6 import in_scene_units
+from acquire.evaluate.paper.studio import scene_of
+from acquire.recon import reconstruct
 from acquire.sim.targets import usaf_picture
+from acquire.simulate import simulate
+from acquire.store import open_recording
 
 GROUPS, FIELD_MM = (2, 3), 6.4
 
@@ -20,6 +26,17 @@ def test_a_sharp_target_is_resolved_and_a_blurred_one_is_not():
     assert contrast["2/1"] > 0.3
     assert contrast["3/4"] < 0.1
     assert contrasts(np.ones((192, 192)), FIELD_MM, GROUPS)["2/1"] == pytest.approx(0, abs=1e-6)
+
+
+@pytest.mark.parametrize("name", ["", "-interline"])
+def test_pictures_of_both_kinds_of_tdi_are_as_bright_as_the_scene(name, tmp_path) -> None:
+    rig = load_rig("rig-interline" if name else "rig-fast", {"geometry.stages": 12})
+    simulate(rig, load_scene(f"scene-usaf{name}"), tmp_path / "r.zarr", 80)
+    recording = open_recording(tmp_path / "r.zarr")
+    segment = recording.cut(16, 60)
+    picture = reconstruct(segment, 1, segment.geometry.span, "fast").video[0]
+    true = scene_of(recording).frames(0, 1)[0]
+    assert in_scene_units(picture, recording).mean() == pytest.approx(true.mean(), rel=0.03)
 
 
 def test_reached_is_equal_and_only_beyond_is_better() -> None:

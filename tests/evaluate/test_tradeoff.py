@@ -11,7 +11,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from acquire.config import load_rig
+from acquire.config import load_rig, load_scene
 from acquire.config.scene import SineDrive
 from acquire.errors import UsageError
 from acquire.evaluate.cases import full_wells, procedural
@@ -73,6 +73,18 @@ def test_a_real_recording_has_no_truth(judge):
     assert blind.end.psnr_db is None
     assert 0 < blind.end.prediction < 1
     assert blind.end.frame is not None
+
+
+def test_the_truth_of_the_baseline_is_in_its_own_pixels_and_sub_steps(tmp_path):
+    rig = load_rig("rig-interline", {"geometry.stages": 12})
+    simulate(rig, load_scene("scene-usaf-interline"), tmp_path / "r.zarr", 100)
+    recording = open_recording(tmp_path / "r.zarr")
+    judge = Judge.of(recording, recording.cut(20, 60))
+    geometry = judge.segment.geometry
+    true = judge.truth(Voxels(1, 1))
+    assert true.shape == (len(range(geometry.span)[geometry.trusted]), 12, 12)
+    found = measure(judge, "admm", Voxels(1, geometry.span), "fast").end
+    assert found.psnr_db > 25
 
 
 def test_procedural_scenes_differ_from_repeat_to_repeat_and_have_their_truth():

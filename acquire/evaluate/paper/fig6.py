@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from acquire.evaluate.paper.studio import Studio
+    from acquire.store import Recording
 
 LINES, FIRST = 263, 70
 GROUPS, FIELD_MM = (2, 3), 6.4
@@ -60,15 +61,13 @@ def figure(studio: Studio) -> PaperFigure:
         recording = studio.record("scene-usaf", LINES + FIRST, interline=kind == INTER)
         segment = recording.cut(FIRST, LINES)
         result = studio.solve(segment, 1, segment.geometry.span, f"static, {kind}")
-        pictures[kind] = result.video[0]
+        pictures[kind] = in_scene_units(result.video[0], recording)
         gains[kind] = studio.gain(segment)
         shot = studio.record(
             "scene-usaf", LINES + FIRST, interline=kind == INTER, gain_dn_per_e=gains[kind]
         ).cut(FIRST, LINES)
         noisy[kind] = studio.solve(shot, 1, shot.geometry.span, f"static, {kind}, camera noise").video[0]
-        if kind == INTER:
-            pictures[kind] = pictures[kind] / 9  # a coarse pixel holds the light of 3 × 3 fine pixels
-        else:
+        if kind == INTRA:
             still = scene_of(recording).frames(0, 1)[0]
     assert still is not None
     contrast = {kind: contrasts(picture, FIELD_MM, GROUPS) for kind, picture in pictures.items()}
@@ -146,6 +145,12 @@ def figure(studio: Studio) -> PaperFigure:
             **{f"r_{khz}_khz_{kind}{TAG[way]}": agreement[khz, kind, way] for khz, kind, way in cases},
         },
     )
+
+
+def in_scene_units(picture: NDArray[Any], recording: Recording) -> NDArray[Any]:
+    """Return a still picture in units of the scene, whose light a coarse sensor sums over k³ fine voxels."""
+    coarse = scene_of(recording).size // recording.geometry_for(1).size
+    return picture / coarse**3
 
 
 def _element(contrast: dict[str, float]) -> str:

@@ -120,7 +120,7 @@ def _lamps(video: NDArray[np.float64], interval_s: float) -> Iterator[Lamp]:
     for number, place in enumerate(QUARTERS):
         inside = quarter == number
         bright = float(np.percentile(mean[inside], 98))
-        if bright < FAINT * float(np.percentile(mean, 99)):
+        if bright <= FAINT * float(np.percentile(mean, 99)):
             continue
         light = region_mean(video, inside & (mean > LIT * bright))
         fit = fit_sine(light, interval_s, harmonics=HARMONICS)
