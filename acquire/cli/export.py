@@ -97,8 +97,10 @@ def export(
     else:
         opened = open_recording(source)
         _refuse_numbers("recording", "--first-line and --lines", first_frame, frames)
+        if all_frames:
+            raise UsageError("--all-frames: a recording has no frames", possible="--all-frames with a video")
         first, count = lines_between(opened, first_line, lines, begin, end)
-        start = 0 if first is None else first - opened.first_line
+        start = (opened.first_available_line if first is None else first) - opened.first_line
         stop = opened.lines if count is None else start + count
         content = recording_content(opened, range(start, stop, average))
     with stage_progress(f"writing {out.name}, MB") as advance:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from contextlib import ExitStack
 from dataclasses import replace
@@ -17,11 +18,15 @@ from acquire.cli.progress import stage_progress
 from acquire.errors import UsageError
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
     from acquire.codes import Code
     from acquire.exchange import Arm, Instrument
 
 DTYPES = {"uint8": "u1", "u8": "u1", "uint16": "<u2", "u16": "<u2", "<u2": "<u2", ">u2": ">u2"}
 """Names for the type of raw binary data → NumPy's name; ``>u2`` is big-endian."""
+LATEST_NS = 4_102_444_800 * 10**9
+"""The beginning of 2100. Times are 64-bit numbers of ns, which end in 2262."""
 
 
 def register(app: typer.Typer) -> None:
@@ -67,13 +72,17 @@ def import_lines(
     lines: Annotated[
         int | None, typer.Option(help="Number of lines of each arm. Default: all lines.")
     ] = None,
-    arm: Annotated[str, typer.Option(help="Arm whose lines a single file holds: a or b.")] = "a",
+    arm: Annotated[
+        str | None, typer.Option(help="Arm whose lines a single file holds: a or b. Default: a.")
+    ] = None,
     dtype: Annotated[
         str | None, typer.Option(help="Sample type of raw binary files: uint8, uint16, or >u2 (big-endian).")
     ] = None,
-    pixels: Annotated[int | None, typer.Option(help="Number of pixels per line in raw binary files.")] = None,
+    pixels: Annotated[
+        int | None, typer.Option(min=1, help="Number of pixels per line in raw binary files.")
+    ] = None,
     skip_bytes: Annotated[
-        int, typer.Option(help="Number of bytes before the first line in raw binary files.")
+        int, typer.Option(min=0, help="Number of bytes before the first line in raw binary files.")
     ] = 0,
     dataset: Annotated[
         str | None,
@@ -132,12 +141,11 @@ def import_lines(
     start_ns = None if start is None else utc_ns(start)
     if start is not None and start_ns is None:
         raise UsageError(f"--start {start!r} is not a time", possible="UTC such as 2026-01-31T12:00:00.25")
+    if start_ns is not None and not 0 <= start_ns < LATEST_NS:
+        raise UsageError(f"--start {start} is out of range", possible="the years 1970 to 2099")
     instrument = replace(
         instrument,
-        cameras={
-            each: {**instrument.cameras.get(each, {}), **{k: v for k, v in options.items() if v is not None}}
-            for each in ("a", "b")
-        },
+        cameras={each: _levels(instrument.cameras.get(each, {}), options) for each in ("a", "b")},
         code_start=code_start,
         first_line=first_line,
         start_ns=start_ns,
@@ -161,6 +169,23 @@ def import_lines(
     say(f"  to check the lines against the code: acquire diagnose {done.path}")
 
 
+def _levels(known: Mapping[str, float], options: Mapping[str, float | None]) -> dict[str, float]:
+    """Return the levels of a camera: those known from the rig file, and the given ones instead."""
+    from acquire.config.base import MOST_DN
+
+    least_dn = {"white_dn": 1e-9, "black_level_dn": 0.0, "responsivity_dn": 1e-9}
+    for key, value in options.items():
+        if value is not None and not least_dn[key] <= value <= MOST_DN:
+            name = f"--{key.partition('_')[0]}"
+            above = "0" if key == "black_level_dn" else "more than 0"
+            raise UsageError(f"{name} {value:g} is out of range", possible=f"{above}, up to {MOST_DN:g}")
+    levels = {**known, **{key: value for key, value in options.items() if value is not None}}
+    black, white = levels.get("black_level_dn", 0.0), levels.get("white_dn", math.inf)
+    if black >= white:
+        raise UsageError(f"the black level, {black:g} DN, is not below white, {white:g} DN")
+    return levels
+
+
 def _columns(text: str | None) -> tuple[int, int] | None:
     if text is None:
         return None
@@ -171,13 +196,23 @@ def _columns(text: str | None) -> tuple[int, int] | None:
 
 
 def _arms(
-    held: ExitStack, files: list[Path], layout: Any, columns: dict[str, tuple[int, int] | None], arm: str
+    held: ExitStack,
+    files: list[Path],
+    layout: Any,
+    columns: dict[str, tuple[int, int] | None],
+    single: str | None,
 ) -> dict[str, Arm]:
-    """Find the lines of each arm: a file of its own, a range of columns, or one of the arms in a file."""
+    """Find the lines of each arm: a file of its own, a range of columns, or one of the arms in a file.
+
+    ``single`` is the arm of a file that holds only one.
+    """
     from acquire.exchange import Arm, open_lines
 
+    arm = single or "a"
     if arm not in columns:
         raise UsageError(f"there is no arm {arm!r}", possible="a, b")
+    if single is not None and (len(files) == 2 or all(columns.values())):
+        raise UsageError(f"--arm {arm}: both arms were given", possible="--arm with a file of one arm")
     if len(files) == 2 or all(columns.values()):
         paths = {"a": files[0], "b": files[-1]}
         opened = {
@@ -190,7 +225,15 @@ def _arms(
                     f"{file.path} has two arms, but there is a file for each arm", possible="one arm per file"
                 )
         return {name: Arm(file) for name, file in opened.items()}
+    other = "b" if arm == "a" else "a"
+    if columns[other] is not None:
+        raise UsageError(
+            f"--columns-{other} selects pixels of arm {other}, but {files[0]} is read as arm {arm}",
+            possible=f"--columns-{arm} as well, for a file with both arms side by side, or --arm {other}",
+        )
     file = held.enter_context(open_lines(files[0], replace(layout, columns=columns[arm])))
+    if single is not None and file.arms == 2:
+        raise UsageError(f"--arm {arm}: {file.path} has two arms", possible="--arm with a file of one arm")
     return {arm: Arm(file)} if file.arms == 1 else {"a": Arm(file, 0), "b": Arm(file, 1)}
 
 
@@ -218,13 +261,14 @@ def _instrument(
             )
         found = replace(
             known,
-            stages=stages or known.stages,
-            substeps=substeps or known.substeps,
+            stages=known.stages if stages is None else stages,
+            substeps=known.substeps if substeps is None else substeps,
             code=light or known.code,
         )
         if line_rate is not None or found.substeps != known.substeps:
-            _check_sizes(found.stages, found.substeps, line_rate or known.line_rate_hz)
-            clock_hz, ticks = clock_of(line_rate or known.line_rate_hz, found.substeps)
+            rate_hz = known.line_rate_hz if line_rate is None else line_rate
+            _check_sizes(found.stages, found.substeps, rate_hz)
+            clock_hz, ticks = clock_of(rate_hz, found.substeps)
             found = replace(found, clock_hz=clock_hz, substep_ticks=ticks)
     _check_sizes(found.stages, found.substeps, found.line_rate_hz)
     return found

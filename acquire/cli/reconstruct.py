@@ -14,7 +14,7 @@ import typer
 from acquire.cli.completion import plans
 from acquire.cli.durations import seconds
 from acquire.cli.interrupts import stop_on_interrupt
-from acquire.cli.output import JsonFlag, note
+from acquire.cli.output import JsonFlag, note, print_json, print_warning
 from acquire.cli.progress import stage_progress
 from acquire.cli.recordings import PlaceArgument
 from acquire.cli.stretch import FirstLineOption, FromOption, LinesOption, ToOption
@@ -22,7 +22,7 @@ from acquire.cli.tiles import TilesOption, tiles_of
 from acquire.errors import EXIT_INTERRUPTED, UsageError
 
 if TYPE_CHECKING:
-    from acquire.cli.reconstruct_request import Arguments
+    from acquire.cli.reconstruct_request import Arguments, Prepared
     from acquire.fibre import Tile
     from acquire.reconstruct import Options, Outcome, VideoRequest
     from acquire.store import Recording
@@ -178,13 +178,12 @@ def reconstruct(
     from acquire.calibrate.choose import choose
     from acquire.cli.reconstruct_explain import explain_calibration
     from acquire.cli.reconstruct_report import print_outcomes, print_prepared
-    from acquire.cli.reconstruct_request import Arguments, prepare
+    from acquire.cli.reconstruct_request import Arguments, check_arguments, prepare, suffixes
     from acquire.config import parse_settings
     from acquire.recon.denoisers import open_denoiser
     from acquire.recon.solver import open_solver
     from acquire.reconstruct import Options
     from acquire.store import open_recording
-    from acquire.store.delivery import check_new_place
 
     # Everything that can be wrong is checked before the solver runs.
     began = time.monotonic() - _age_s()
@@ -224,32 +223,26 @@ def reconstruct(
         ),
         tiles=chosen_tiles,
     )
-    explain_calibration(opened, chosen, arguments, wanted=explain, json=json and out is None)
+    check_arguments(arguments)
+    places = [] if out is None else _new_places(out, suffixes(arguments))
+    for doubt in () if chosen is None else chosen.doubts:
+        print_warning(doubt)
+    explained = explain_calibration(opened, chosen, arguments, json=json) if explain else {}
     if explain and not (out or auto):
+        if json:
+            print_json(explained)
         return
     prepared = prepare(opened, _with_orientation(opened, arguments) if try_orientations else arguments)
     if not json:
         print_prepared(prepared)
     if out is None:
+        if json and prepared.plan is not None:
+            print_json({**explained, "plan": prepared.plan.model_dump(mode="json", exclude_none=True)})
         return
-
-    # One of several videos has its voxel size in its name: NAME.zarr becomes NAME-1x820.zarr.
-    stem = out.rstrip("/")
-    places = [
-        re.sub(r"(\.[^./]*)?$", rf"-{suffix}\1", stem, count=1) if suffix else out
-        for suffix in prepared.requests
-    ]
-    for place in places:
-        check_new_place(place)
     if workers is None and (preview or (budget is not None and budget < PROCESSES_FROM * _age_s())):
         workers = 1  # starting processes would take at least as long as starting this one did
-    outcomes: list[Outcome] = []
-    for place, request in zip(places, prepared.requests.values(), strict=True):
-        options = _with_share(prepared.options, time.monotonic() - began, len(places) - len(outcomes))
-        outcomes.append(_run(opened, request, place, options, (workers, dask), began))
-        if outcomes[-1].interrupted:
-            break
-    print_outcomes(outcomes, json=json, preview=preview)
+    outcomes = _make(opened, prepared, places, (workers, dask), began)
+    print_outcomes(outcomes, json=json, preview=preview, more={"explained": explained} if explained else {})
     if outcomes[-1].interrupted:
         raise typer.Exit(EXIT_INTERRUPTED)
 
@@ -262,6 +255,37 @@ def _check_options(search: str | None, *, anything_wanted: bool) -> None:
         )
     if search not in SEARCHES:
         raise UsageError(f"there is no --search {search}", possible="each, shared")
+
+
+def _new_places(out: str, names: list[str]) -> list[str]:
+    """Return the place of each video: NAME.zarr, or one of several, NAME-1x820.zarr.
+
+    Raises UsageError if one exists.
+    """
+    from acquire.store.delivery import check_new_place
+
+    stem = out.rstrip("/")
+    places = [re.sub(r"(\.[^./]*)?$", rf"-{name}\1", stem, count=1) if name else out for name in names]
+    for place in places:
+        check_new_place(place)
+    return places
+
+
+def _make(
+    recording: Recording,
+    prepared: Prepared,
+    places: list[str],
+    where: tuple[int | None, str | None],
+    began: float,
+) -> list[Outcome]:
+    """Make the videos one after the other, until the first that is interrupted."""
+    outcomes: list[Outcome] = []
+    for place, request in zip(places, prepared.requests.values(), strict=True):
+        options = _with_share(prepared.options, time.monotonic() - began, len(places) - len(outcomes))
+        outcomes.append(_run(recording, request, place, options, where, began))
+        if outcomes[-1].interrupted:
+            break
+    return outcomes
 
 
 def _with_share(options: Options, elapsed_s: float, videos: int) -> Options:
@@ -287,12 +311,13 @@ def _tiles(recording: Recording, text: str | None, *, turned: bool) -> tuple[Til
 
 def _with_orientation(recording: Recording, arguments: Arguments) -> Arguments:
     """Adopt the orientation of the arms that the lines show, if the evidence is clear; report the result."""
+    from acquire.cli.reconstruct_request import requested_lines
     from acquire.recon.diagnosis import TURNED
     from acquire.recon.hypotheses import AS_BUILT
     from acquire.recon.search import Standing
     from acquire.reconstruct.diagnose import diagnose_recording, diagnosed_range
 
-    first, count = diagnosed_range(recording, arguments.first_line, arguments.lines)
+    first, count = diagnosed_range(recording, *requested_lines(recording, arguments))
     found = diagnose_recording(recording, first, count, arguments.options.calibration)
     turn = AS_BUILT if found.hypothesis is None else found.hypothesis.turn
     if found.standing is Standing.NAMED and turn != AS_BUILT and found.alternative is None:
@@ -322,7 +347,8 @@ def _run(
     from acquire.reconstruct import Watcher, combine, open_pool
 
     tasks, (workers, cluster) = len(request.stretches) * max(1, len(request.tiles)), where
-    at_once = workers or (None if options.device == "cpu" else 1)  # one process fills a GPU
+    if workers is None and options.device != "cpu":
+        workers = 1  # one process fills a GPU
     with (
         stop_on_interrupt("finishing the current sub-segments with their results so far") as stop_requested,
         stage_progress(
@@ -330,5 +356,5 @@ def _run(
         ) as advance,
     ):
         watcher = Watcher(tasks, advance, stop_requested.is_set)
-        with open_pool(tasks, at_once, cluster, watcher) as pool:
+        with open_pool(tasks, workers, cluster, watcher) as pool:
             return combine(recording, request, out, options, pool, watcher, began)

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import asdict
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
-from acquire.cli.output import print_json, print_table, print_warning, say
+from acquire.cli.output import print_table, say
 from acquire.cli.progress import stage_progress
-from acquire.cli.reconstruct_request import parse_voxels
+from acquire.cli.reconstruct_request import parse_voxels, requested_lines
 from acquire.errors import UsageError
 
 if TYPE_CHECKING:
@@ -17,21 +17,16 @@ if TYPE_CHECKING:
 
 
 def explain_calibration(
-    recording: Recording, chosen: Chosen | None, arguments: Arguments, *, wanted: bool, json: bool
-) -> None:
-    """Warn about doubts in the calibration. If ``wanted``, also leave out its parts in turn and print a
-    table.
+    recording: Recording, chosen: Chosen | None, arguments: Arguments, *, json: bool
+) -> dict[str, Any]:
+    """Leave out the parts of the calibration in turn; return the effects, and print a table unless ``json``.
 
     The parts are tried on lines in the middle of the selected range.
     """
-    from acquire.cores import idle_cores, limit_blas
     from acquire.reconstruct.explain import MOST_LINES, explain
     from acquire.reconstruct.liveliest import representative_tile
+    from acquire.reconstruct.select import by_lines
 
-    for doubt in () if chosen is None else chosen.doubts:
-        print_warning(doubt)
-    if not wanted:
-        return
     if chosen is None:
         raise UsageError(
             f"{recording} carries no calibration to be explained",
@@ -39,22 +34,18 @@ def explain_calibration(
             hint="acquire calibrate, to make one",
         )
     voxels = parse_voxels(arguments.voxels[0])
-    first = recording.first_available_line if arguments.first_line is None else arguments.first_line
-    lines = recording.first_line + recording.lines - first if arguments.lines is None else arguments.lines
-    count = min(lines, MOST_LINES)
-    middle = (first + (lines - count) // 2, count)
+    first, lines = requested_lines(recording, arguments)
+    stream = by_lines(recording, recording.first_available_line if first is None else first, lines).stream
+    count = min(stream.end_line - stream.first_line, MOST_LINES)
+    middle = ((stream.first_line + stream.end_line - count) // 2, count)
     tile = representative_tile(recording, arguments.tiles, middle, chosen.calibration)
     segment = recording.cut(*middle, tile)
-    with (
-        stage_progress("leaving out the parts of the calibration in turn") as advance,
-        limit_blas(idle_cores()),
-    ):
+    with stage_progress("leaving out the parts of the calibration in turn") as advance:
         found = explain(segment, chosen.calibration, voxels.spatial_merge, voxels.temporal_merge, advance)
+    tile_facts = {} if tile is None else {"tile": str(tile)}
+    facts = {"calibration": chosen.origin, **tile_facts, "parts": [asdict(worth) for worth in found]}
     if json:
-        tile_facts = {} if tile is None else {"tile": str(tile)}
-        parts = [asdict(worth) for worth in found]
-        print_json({"calibration": chosen.origin, **tile_facts, "parts": parts})
-        return
+        return facts
     which = f"{count} lines from line {segment.first_line}" + ("" if tile is None else f" of tile {tile}")
     say(f"calibration: {chosen.origin}; {which}, voxels {voxels}")
     rows = []
@@ -66,3 +57,4 @@ def explain_calibration(
             gain, factor = f"{worth.gain_db:+.1f}", f"x {worth.time_factor:.2f}"
             rows.append((f"all but {worth.part}", error, gain, factor))
     print_table(("corrected", "held-out error", "gain (dB)", "time"), rows)
+    return facts

@@ -27,13 +27,16 @@ def print_prepared(prepared: Prepared) -> None:
         say()
 
 
-def print_outcomes(outcomes: list[Outcome], *, json: bool, preview: bool) -> None:
+def print_outcomes(outcomes: list[Outcome], *, json: bool, preview: bool, more: dict[str, Any]) -> None:
     """Print the facts, the sub-segments and the warnings of each video.
 
-    A preview gets no warnings: that its large voxels do not explain the lines is expected.
+    A preview gets no warnings: that its large voxels do not explain the lines is expected. ``more`` is added
+    to the JSON of each.
     """
     if json:
-        facts = [{"path": str(each.path), "shape": each.shape, **each.provenance} for each in outcomes]
+        facts = [
+            {"path": str(each.path), "shape": each.shape, **each.provenance, **more} for each in outcomes
+        ]
         print_json(facts[0] if len(facts) == 1 else facts)
         return
     for outcome in outcomes:

@@ -12,7 +12,6 @@ from acquire.cli.moments import after_ns
 from acquire.cli.progress import stage_progress
 from acquire.cli.stretch import first_ns, lines_between
 from acquire.config import check_plan, load_plan
-from acquire.cores import idle_cores, limit_blas
 from acquire.errors import UsageError
 from acquire.recon.segments import Stretch, Voxels
 from acquire.reconstruct.learned import Choice, choose, recall
@@ -105,11 +104,29 @@ def prepare(recording: Recording, arguments: Arguments) -> Prepared:
     return replace(prepared, options=options, learned=choice.why)
 
 
-def _requests(recording: Recording, arguments: Arguments) -> Prepared:
+def check_arguments(arguments: Arguments) -> None:
+    """Raise UsageError for arguments that contradict each other, and for a plan file that exists."""
     if arguments.ends not in ENDS:
         raise UsageError(f"there is no --ends {arguments.ends}", possible="trusted, whole")
-    if (arguments.plan is not None) + bool(arguments.segments) + arguments.auto + arguments.preview > 1:
+    planned = (arguments.plan is not None) + bool(arguments.segments) + arguments.auto
+    if planned + arguments.preview > 1:
         raise UsageError("--plan, --segment, --auto and --preview exclude each other", possible="one of them")
+    if arguments.save_plan is not None:
+        if not planned:
+            raise UsageError(
+                "--save-plan: there is no plan to save", possible="with --auto, --plan or --segment"
+            )
+        check_new_path(arguments.save_plan)
+
+
+def suffixes(arguments: Arguments) -> list[str]:
+    """Return what distinguishes the name of each video: its voxel size, or nothing if there is one video."""
+    kinds = dict.fromkeys(map(parse_voxels, arguments.voxels))
+    single = arguments.plan is not None or arguments.segments or arguments.auto or arguments.preview
+    return [""] if single or len(kinds) == 1 else [str(kind) for kind in kinds]
+
+
+def _requests(recording: Recording, arguments: Arguments) -> Prepared:
     selection, whole = _select(recording, arguments), ENDS[arguments.ends]
     if arguments.preview:
         options = replace(
@@ -125,10 +142,9 @@ def _requests(recording: Recording, arguments: Arguments) -> Prepared:
         if arguments.save_plan is not None:
             _write_plan(arguments.save_plan, plan)
         return Prepared({"": along_plan(selection, plan)}, arguments.options, plan)
-    kinds = [parse_voxels(text) for text in arguments.voxels]
+    kinds = dict.fromkeys(map(parse_voxels, arguments.voxels))
     requests = [in_voxels(selection, kind, whole_ends=whole) for kind in kinds]
-    names = [str(kind) if len(kinds) > 1 else "" for kind in kinds]
-    return Prepared(dict(zip(names, requests, strict=True)), arguments.options)
+    return Prepared(dict(zip(suffixes(arguments), requests, strict=True)), arguments.options)
 
 
 def parse_voxels(text: str) -> Voxels:
@@ -153,6 +169,22 @@ def parse_segment(text: str) -> dict[str, float]:
     elif length:
         table["seconds"] = parse_duration_ns(length) * 1e-9
     return table
+
+
+def requested_lines(recording: Recording, arguments: Arguments) -> tuple[int | None, int | None]:
+    """Return the first line and the number of lines that show the requested range; None without a limit.
+
+    Raises UsageError for times that the lines do not show.
+    """
+    first, count, begin, end = arguments.first_line, arguments.lines, arguments.begin, arguments.end
+    if first is not None or count is not None:
+        return lines_between(recording, first, count, begin, end)
+    if begin is None and end is None:
+        return None, None
+    selection = _select(recording, arguments)
+    shown = Stretch(*selection.extent(Voxels(1, 1), Voxels(1, 1), whole=False), Voxels(1, 1))
+    needed = selection.stream.sub_segment(shown)
+    return needed.first_line, None if end is None else needed.lines
 
 
 def _select(recording: Recording, arguments: Arguments) -> Selection:
@@ -192,11 +224,7 @@ def _plan(recording: Recording, selection: Selection, arguments: Arguments) -> R
     if arguments.auto:
         from acquire.reconstruct.propose import propose
 
-        # BLAS threads that wait for a busy core would make this take five times as long
-        with (
-            stage_progress("looking for changes in the scene", "--from and --to, for a part") as advance,
-            limit_blas(idle_cores()),
-        ):
+        with stage_progress("looking for changes in the scene", "--from and --to, for a part") as advance:
             return propose(
                 recording,
                 selection,

@@ -66,7 +66,8 @@ def render(
 
     sheet = out.suffix.lower() == ".png"
     count = frames if frames is not None else SHEET_FRAMES if sheet else MOVIE_FRAMES
-    look = Look(height or (SHEET_HEIGHT if sheet else MOVIE_HEIGHT), peak, fps)
+    usual_px = SHEET_HEIGHT if sheet else MOVIE_HEIGHT
+    look = Look(usual_px if height is None else height, peak, fps)
     for name, value, low, high in (
         ("--frames", count, 1, 100_000),
         ("--height", look.panel_px, 16, 4096),

@@ -71,8 +71,9 @@ def lines_between(
         )
     first = first_line if begin is None else _line(recording, begin)
     last = math.inf if to_come else recording.first_line + recording.lines
-    if begin is not None and first is not None and not recording.first_line <= first < last:
-        raise UsageError(f"{recording} has no line at or after {begin}", possible=span(recording))
+    if first is not None and not recording.first_line <= first < last:
+        asked = f"line {first}" if begin is None else f"line at or after {begin}"
+        raise UsageError(f"{recording} has no {asked}", possible=span(recording))
     if end is None:
         return first, lines
     start = recording.first_available_line if first is None else first

@@ -155,7 +155,6 @@ def _measure(
     host: HostWatch,
 ) -> tuple[list[Run], dict[tuple[str, Voxels], Any]]:
     """Measure every combination of solver, preset and dtype; return the runs and the true frames to show."""
-    from acquire.cores import idle_cores, limit_threads
     from acquire.evaluate.tradeoff import measure
 
     runs, truths = [], {}
@@ -165,7 +164,7 @@ def _measure(
         for voxels, (solver, preset, dtype) in itertools.product(kinds, combinations):
             host.look()
             what = f"{case.name}: {solver} {preset} {voxels}, {repeat + 1} of {repeats}"
-            with stage_progress(what) as advance, limit_threads(idle_cores()):
+            with stage_progress(what) as advance:
                 run = measure(
                     judge,
                     solver,

@@ -37,6 +37,8 @@ BLOCK_LINES = 4096
 COMMIT_BLOCKS = 64
 SUBSTEP_TICKS = 1000
 """Ticks per sub-step of the clock if only the line rate is known."""
+MOST = 2**62
+"""Limit of ticks, and of the time since line 0 (ns): with the time of line 0, 64 bits still suffice."""
 UNKNOWN_NS = 2**62
 """Uncertainty of an unknown clock."""
 NO_ARM = "not_imported"
@@ -174,6 +176,7 @@ def _checked(arms: Mapping[str, Arm], instrument: Instrument, most_lines: int | 
             )
     lines = next(iter(counts.values()))
     _check_code(instrument, lines)
+    _check_times(instrument, lines)
     return lines
 
 
@@ -189,6 +192,16 @@ def _check_code(instrument: Instrument, lines: int) -> None:
             f"the code has {code.length} bits, and {lines} lines touch {needed}",
             possible="S·(M + lines) − 1 bits, starting with the first line's",
             hint="--code-repeats, if the sequence repeats, or fewer --lines",
+        )
+
+
+def _check_times(instrument: Instrument, lines: int) -> None:
+    """Raise UsageError if the last lines' ticks or times do not fit into 64 bits."""
+    ticks, seconds = MOST // (instrument.substep_ticks * instrument.substeps), MOST // 10**9
+    most = min(ticks, int(seconds * instrument.line_rate_hz)) - lines - instrument.stages
+    if instrument.first_line > most:
+        raise UsageError(
+            f"line {instrument.first_line} is too late for a recording's clock", possible=f"up to line {most}"
         )
 
 

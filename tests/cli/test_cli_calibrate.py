@@ -137,6 +137,12 @@ def test_the_effect_of_each_part_is_reported(cli: Cli, taken: dict[str, Path], t
     assert parts["all of it"]["prediction"] < parts["nothing"]["prediction"]
     assert parts["arm B laid on arm A"]["gain_db"] > 1
     assert cli("reconstruct", taken["target"], "--explain").code == 2
+    words = ("--calibration", cal, "--from", "L150", "--lines", 110, "--nm", 1, "--tm", 431)
+    told = cli(
+        "reconstruct", taken["target"], "--explain", *words, "--out", tmp_path / "v.zarr", "--json"
+    ).json
+    assert [part["part"] for part in told["explained"]["parts"]] == list(parts)
+    assert "110 lines from line 150," in cli("reconstruct", taken["target"], "--explain", *words).out
 
 
 def test_one_of_another_instrument_is_refused(cli: Cli, taken: dict[str, Path], tmp_path: Path) -> None:

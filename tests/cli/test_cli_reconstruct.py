@@ -14,11 +14,13 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from acquire.cli.reconstruct_request import Arguments, requested_lines
 from acquire.config import load_rig
 from acquire.config.scene import ConstantDrive, SineDrive
+from acquire.reconstruct import Options
 from acquire.sim.leds import LedConfig, LedSceneConfig
 from acquire.simulate import simulate
-from acquire.store import open_video
+from acquire.store import open_recording, open_video
 
 Cli = Callable[..., Any]
 
@@ -61,6 +63,37 @@ def test_lines_and_times(cli: Cli, recording: Path, tmp_path: Path) -> None:
     assert video.time_ns[0] - start == 1_000_000
 
 
+@pytest.mark.parametrize(
+    ("first", "count", "begin", "end", "selected"),
+    [
+        (None, None, None, None, (None, None)),
+        (20, None, None, None, (20, None)),
+        (None, 50, "L30", None, (30, 50)),
+        (None, None, "2ms", None, (100, None)),
+        (None, None, "2ms", "3ms", (100, 62)),  # 50 lines, and those of 12 stages that also see the range
+    ],
+)
+def test_lines_that_show_a_range(
+    recording: Path, first: Any, count: Any, begin: Any, end: Any, selected: Any
+) -> None:
+    arguments = Arguments(
+        first_line=first,
+        lines=count,
+        begin=begin,
+        end=end,
+        voxels=("2x1",),
+        plan=None,
+        segments=(),
+        auto=False,
+        save_plan=None,
+        ends=None,
+        preview=False,
+        preset=None,
+        options=Options("balanced"),
+    )
+    assert requested_lines(open_recording(recording), arguments) == selected
+
+
 def test_several_voxels_side_by_side(cli: Cli, recording: Path, tmp_path: Path) -> None:
     words = ("--lines", 120, "--voxels", "1x66", "--voxels", "2x3", "--iterations", 8)
     assert cli("reconstruct", recording, "--out", tmp_path / "v.zarr", *words).code == 0
@@ -71,6 +104,8 @@ def test_several_voxels_side_by_side(cli: Cli, recording: Path, tmp_path: Path) 
     assert answer.code == 0, answer.err
     with Image.open(tmp_path / "both.png") as sheet:
         assert sheet.width > 6 * 190
+    refused = cli("render", slow, "--out", tmp_path / "flat.png", "--height", 0)
+    assert (refused.code, "--height 0 is out of range" in refused.err) == (2, True)
     answer = cli("render", slow, fast, "--out", tmp_path / "both.html", "--json")
     assert answer.code == 0, answer.err
     page = (tmp_path / "both.html").read_text(encoding="utf-8")
@@ -118,6 +153,31 @@ def test_a_proposed_plan_is_written_and_read_again(cli: Cli, recording: Path, tm
         tmp_path / "v.zarr",
     )
     assert again.code == 0, again.err
+
+
+def test_a_proposed_plan_for_programs(cli: Cli, recording: Path) -> None:
+    answer = cli("reconstruct", recording, "--auto", "--lines", 60, "--json")
+    assert answer.code == 0, answer.err
+    assert answer.json["plan"]["segments"][0]["temporal_merge"] >= 1
+
+
+def test_nothing_slow_is_done_for_a_file_that_exists(cli: Cli, recording: Path, tmp_path: Path) -> None:
+    """Neither the plan nor the video is overwritten, and no plan is left behind by a refused command."""
+    taken, plan = tmp_path / "taken.zarr", tmp_path / "plan.toml"
+    taken.touch()
+    words = ("reconstruct", recording, "--lines", 150, "--segment", ":2x2")
+    answer = cli(*words, "--save-plan", plan, "--out", taken)
+    assert (answer.code, plan.exists()) == (2, False)
+    assert "taken.zarr exists already" in answer.err
+    answer = cli("reconstruct", recording, "--auto", "--save-plan", taken)
+    assert answer.code == 2
+    assert "looking for changes" not in answer.err
+
+
+def test_the_same_voxels_twice_are_one_video(cli: Cli, recording: Path, tmp_path: Path) -> None:
+    words = ("--lines", 60, "--voxels", "2x3", "--voxels", "2x3", "--iterations", 2)
+    assert cli("reconstruct", recording, "--out", tmp_path / "v.zarr", *words).code == 0
+    assert [path.name for path in tmp_path.iterdir()] == ["v.zarr"]
 
 
 def test_a_preview_is_coarse(cli: Cli, recording: Path, tmp_path: Path) -> None:
@@ -168,6 +228,8 @@ def test_a_video_is_written_to_a_url_and_rendered_from_it(cli: Cli, recording: P
         (("--ends", "half"), "trusted, whole"),
         (("--lines", 5), "more than 12 lines"),
         (("--preset", "perfect"), "balanced"),
+        (("--save-plan", "plan.toml"), "with --auto, --plan or --segment"),
+        (("--workers", 0), "1 or more"),
         (("--dtype", "float16"), "float32, float64"),
         (("--device", "tpu"), "cpu, gpu"),
     ],

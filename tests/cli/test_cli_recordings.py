@@ -272,6 +272,23 @@ def test_hold_keeps_lines_of_a_recording_that_grows(cli: Cli, tmp_path: Path) ->
         assert cli("cut", path, "--first-line", FIRST, "--lines", 5, "--out", tmp_path / "c.npz").code == 0
 
 
+def test_an_export_begins_with_the_first_line_that_is_left(cli: Cli, tmp_path: Path) -> None:
+    path = tmp_path / "endless.zarr"
+    policy = Retention(max_age_lines=16, margin_lines=4)
+    with RecordingWriter.create(path, replace(spec(), retention=policy, shard_chunks=1)) as writer:
+        for arm in ARMS:
+            writer.append(block(arm, range(0)))
+        writer.commit()
+    left = FIRST + 64 - open_recording(path).first_available_line
+    assert left < 64
+    for number, options in enumerate(((), ("--to", f"L{FIRST + 64}"))):
+        out = tmp_path / f"{number}.npy"
+        answer = cli("export", path, out, *options)
+        assert (answer.code, np.load(out).shape[1]) == (0, left), answer.err
+    answer = cli("export", path, tmp_path / "a.npy", "--all-frames")
+    assert (answer.code, "a recording has no frames" in answer.err) == (2, True)
+
+
 def test_lines_that_a_copy_needs_are_held_without_an_end(cli: Cli, tmp_path: Path) -> None:
     path = tmp_path / "endless.zarr"
     policy = Retention(max_age_lines=16, margin_lines=4, copied_to=f"memory://{tmp_path.name}")

@@ -106,6 +106,8 @@ def test_a_range_is_given_in_lines_or_in_times(
         (("--from", "9ms", "--to", "8ms"), "there are no lines from 9ms to 8ms"),
         (("--from", "soon"), "the time 'soon' cannot be read"),
         (("--from", "L2000", "--lines", "9"), "has no line at or after L2000"),
+        (("--first-line", "2000"), "has no line 2000"),
+        (("--first-line", "-1"), "has no line -1"),
     ],
 )
 def test_an_invalid_range_is_refused(

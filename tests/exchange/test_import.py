@@ -230,6 +230,21 @@ def test_lines_from_the_middle_of_a_run_have_its_code(
         (["a.npy", *SIZES[:-1], "bits:pipe.raw"], "it is a pipe"),
         (["archive.npy", *SIZES], "an archive of several arrays"),
         (["a.npy", "b.npy", "a.npy", *SIZES], "3 files of lines"),
+        (["a.npy", "--config", "rig-demo", "--stages", 0], "--stages 0 is out of range"),
+        (["a.npy", "--config", "rig-demo", "--substeps", 0], "--substeps 0 is out of range"),
+        (["a.npy", "--config", "rig-demo", "--line-rate", 0], "--line-rate 0 is out of range"),
+        (["a.npy", *SIZES, "--white", -1], "--white -1 is out of range"),
+        (["a.npy", *SIZES, "--white", "nan"], "--white nan is out of range"),
+        (["a.npy", *SIZES, "--responsivity", 0], "--responsivity 0 is out of range"),
+        (["a.npy", *SIZES, "--black", 300, "--white", 255], "300 DN, is not below white, 255 DN"),
+        (["a.npy", "b.npy", *SIZES, "--arm", "b"], "--arm b: both arms were given"),
+        (["both.npy", *SIZES, "--arm", "b"], "both.npy has two arms"),
+        (["a.npy", *SIZES, "--columns-b", "0:8"], "or --arm b"),
+        (["a.raw", *SIZES, "--dtype", "u16", "--pixels", 8, "--skip-bytes", -16], "0 or more"),
+        (["a.npy", *SIZES, "--start", "0001-01-01"], "1970 to 2099"),
+        (["a.npy", *SIZES, "--start", "2300-01-01"], "1970 to 2099"),
+        (["a.npy", *SIZES, "--first-line", 10**20], "possible: up to line "),
+        (["a.npy", *SIZES, "--first-line", 10**15], "possible: up to line "),
     ],
 )
 def test_inconsistent_input_is_refused_and_nothing_is_written(
@@ -238,7 +253,7 @@ def test_inconsistent_input_is_refused_and_nothing_is_written(
     as_npy(tmp_path, lines)
     for name, array in (
         ("short", lines["a"][:-1]), ("float", lines["a"].astype(float)), ("flat", lines["a"][:, 0]),
-        ("three", np.stack([lines["a"]] * 3)),
+        ("three", np.stack([lines["a"]] * 3)), ("both", np.stack([lines["a"]] * 2)),
     ):  # fmt: skip
         np.save(tmp_path / f"{name}.npy", array)
     for suffix in ("npy", "h5", "tif"):

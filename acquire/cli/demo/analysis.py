@@ -10,7 +10,6 @@ import numpy as np
 from acquire.cli.demo.plan import N_M, SEGMENT_LINES, T_M, segment_row
 from acquire.cli.progress import stage_progress
 from acquire.config.scene import SineDrive
-from acquire.cores import idle_cores, limit_blas
 from acquire.evaluate.host import HostWatch
 from acquire.evaluate.report import (
     ArmLedger,
@@ -118,7 +117,7 @@ def analyse(plan: DemoPlan, captured: Captured, rig: RigConfig, journal: Journal
 
 def _solve(method: Method, segment: Segment, journal: Journal) -> Reconstruction:
     name = f"Reconstruct: {method.label}"
-    with journal.stage(name) as note, stage_progress(name) as advance, limit_blas(idle_cores()):
+    with journal.stage(name) as note, stage_progress(name) as advance:
         result = reconstruct(
             segment,
             N_M,
