@@ -30,8 +30,11 @@ SMOOTHINGS = (4.0, 0.0)
 EDGE = 4
 """Fine pixels at the rim that are not compared, since splines and dark columns affect them."""
 NUMBERS = ("rows", "columns", "turn_deg", "magnification")
-WORST = {"rows": 0.15, "columns": 0.15, "turn_deg": 0.1, "magnification": 0.002}
-"""Uncertainties beyond which an alignment is useless, as from a target without texture."""
+WORST_PIXELS = 0.2
+"""Uncertainty of shift, turn or magnification, in fine pixels at the field's edge, beyond which an alignment
+is useless, as from a target without texture."""
+LEAST_CORRELATION = 0.5
+"""Of the two images where they meet. Without texture, noise alone may seem to determine an alignment."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,8 +59,18 @@ def align(a: Still, b: Still, geometry: Geometry, start: tuple[float, float] = (
     numbers = np.array([*start, 0.0, 0.0, 1.0, 0.0])
     for sigma in SMOOTHINGS:
         comparison = _Comparison(images, sigma)
-        solved = least_squares(comparison, numbers, x_scale=comparison.scale, method="trf", loss="soft_l1")
-        numbers = solved.x
+        # Outliers are told by the spread of the differences, which in clean images exceeds the noise by far.
+        for loss in ("linear", "soft_l1"):
+            spread = float(np.median(np.abs(comparison(numbers)))) / 0.6745
+            solved = least_squares(
+                comparison,
+                numbers,
+                x_scale=comparison.scale,
+                method="trf",
+                loss=loss,
+                f_scale=max(1.0, spread),
+            )
+            numbers = solved.x
     alignment = _alignment(numbers, geometry)
     freedom = max(1, len(solved.fun) - len(numbers))
     try:
@@ -66,10 +79,11 @@ def align(a: Still, b: Still, geometry: Geometry, start: tuple[float, float] = (
         covariance = np.linalg.inv(jacobian.T @ jacobian) * 2 * solved.cost / freedom
     except np.linalg.LinAlgError as error:
         raise _undetermined() from error
-    errors = np.sqrt(np.diag(covariance)) * _units(geometry)
-    uncertainty = dict(zip(NUMBERS, errors.tolist(), strict=False))
-    if any(not uncertainty[name] <= worst for name, worst in WORST.items()):
+    errors = np.sqrt(np.diag(covariance))
+    determined = errors[: len(NUMBERS)].max() <= WORST_PIXELS
+    if not (determined and comparison.correlation(numbers) >= LEAST_CORRELATION):
         raise _undetermined()
+    uncertainty = dict(zip(NUMBERS, (errors * _units(geometry)).tolist(), strict=False))
     found = AlignmentFound(alignment, uncertainty)
     return Match(found, comparison.misfit(numbers), comparison.brightness(numbers))
 
@@ -138,6 +152,14 @@ class _Comparison:
         if not residual.size:
             return float("inf")
         return float(np.sqrt(np.mean(residual**2)) / max(self._level, 1e-12))
+
+    def correlation(self, numbers: NDArray[np.float64]) -> float:
+        """Return the correlation coefficient of the images; 0 where either is uniform."""
+        a, b, inside = self._pairs(numbers)
+        a, b = (image[self._good & inside] for image in (a, b))
+        if a.size < 2 or not (a.std() > 0 and b.std() > 0):
+            return 0.0
+        return float(np.corrcoef(a, b)[0, 1])
 
     def brightness(self, numbers: NDArray[np.float64]) -> float:
         """Return B's light over A's; not the fitted factor, which blur and noise of each image lower."""

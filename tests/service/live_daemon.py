@@ -49,7 +49,7 @@ pixel_format = "Mono12"
 responsivity_dn = 40.0
 [stream]
 block_lines = 64
-ring_slots = 1024
+ring_slots = 4096            # 26 s: the disk of a busy host may pause
 [recording]
 directory = "{directory}"
 chunk_lines = 256

@@ -28,7 +28,7 @@ SEEN_MS = 120_000
 
 @pytest.fixture
 def daemon(tmp_path: Path) -> Iterator[Daemon]:
-    with contextlib.closing(Daemon(tmp_path, "web.port=0", "stream.ring_slots=256")) as made:
+    with contextlib.closing(Daemon(tmp_path, "web.port=0")) as made:
         yield made
 
 
