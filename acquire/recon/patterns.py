@@ -145,7 +145,7 @@ class Refinement:
         merges: tuple[int, int],
         parameters: AdmmParameters = PARAMETERS,
     ) -> None:
-        self._segment, self._problem, self._cosines = segment, problem, cosines
+        self.segment, self._problem, self._cosines = segment, problem, cosines
         self._spatial_merge, self._temporal_merge = merge, temporal_merge = merges
         self.parameters, self._first, self._steps = parameters, parameters, 0
         self.loosens = True
@@ -216,7 +216,7 @@ class Refinement:
         other = copy(self)
         other._start(found)
         other._fit = CurveFit(
-            self._segment, self._problem, self._cosines, self._temporal_merge, RIDGE, learns=True
+            self.segment, self._problem, self._cosines, self._temporal_merge, RIDGE, learns=True
         )
         other._fit.prior = self._fit.prior
         return other
@@ -230,7 +230,7 @@ class Refinement:
         other.parameters = replace(self.parameters, tv_weight=heavier * self.parameters.tv_weight)
         other._first = replace(self._first, tv_weight=heavier * self._first.tv_weight)
         other._problem, other._steps = problem, 0
-        other._fit = CurveFit(self._segment, problem, self._cosines, self._temporal_merge, RIDGE, learns=True)
+        other._fit = CurveFit(self.segment, problem, self._cosines, self._temporal_merge, RIDGE, learns=True)
         other._fit.prior = self._fit.prior
         operator, basis = other._operators()
         other._admm = self._admm.with_problem(operator, problem.used_samples, heavier)
@@ -252,7 +252,7 @@ class Refinement:
             patterns = (kept.T @ flat).reshape(-1, *found.patterns.shape[1:])
             return Patterns(found.curves @ kept, self._problem.arrays.asarray(patterns.astype(kept.dtype)))
 
-        noise = self._problem.noise(self._segment)
+        noise = self._problem.noise(self.segment)
         floor = noise**2 if noise < np.inf else 0.0  # NaN if it is unknown
 
         def beyond_noise() -> float:
@@ -281,9 +281,9 @@ class Refinement:
     def _operators(self) -> tuple[MaskedOperator, LearnedBasis]:
         """The patterns' operator and the basis of their curves, for the present curves."""
         basis = LearnedBasis(self._cosines, self.found.curves)
-        geometry, code = self._segment.geometry, self._segment.code
+        geometry, code = self.segment.geometry, self.segment.code
         self._operator: Operator = band_operator(
-            geometry, code, basis, 1, self._temporal_merge, self._segment.alignment, self._segment.blur
+            geometry, code, basis, 1, self._temporal_merge, self.segment.alignment, self.segment.blur
         )
         return self._problem.masked(self._operator), basis
 

@@ -5,7 +5,8 @@
 The first look tells patterns from its own errors by their energy alone, and may find too many. Superfluous
 ones fit noise: the picture loses 2 to 10 dB while the lines are explained. The held-out samples end the
 refinement, and the round that predicted them best is the result: at full resolution there is no model error
-to fit, so that they are predicted better as long as the picture improves.
+to fit, so that they are predicted better as long as the picture improves. Next to the noise they rise and
+fall by more than λ changes them; there the used samples tell that it is fitted, and λ should be larger.
 """
 
 from __future__ import annotations
@@ -29,7 +30,11 @@ LOOSENED_IN_VAIN, PATIENCE = 3, 6
 """Number of rounds without improvement after which λ is no longer lowered, because noise is being fitted, and
 that end a refinement."""
 TIGHTER = 2.0
-"""λ from then on, relative to that of the best round, which lagged behind the λ that it was given."""
+"""λ from then on, relative to that of the best round, which lagged behind the λ that it was given; and the
+step to the λ that is tried next."""
+SURE = 2.0
+"""Standard errors of the held-out RMS by which a round must be worse to count as clearly so. By as much it
+rises and falls from round to round, and of λ that predict equally well the largest fits the least noise."""
 LONG = 60
 """Number of iterations from which a refinement lets doubtful patterns go only after a trial. A shorter one
 has no time for that, nor to recover from patterns that fit noise."""
@@ -50,30 +55,33 @@ def settle(refinement: Refinement, problem: Problem, clock: IterationClock) -> R
     course.settles(clock, LOOSENED_IN_VAIN, EARLY_ROUNDS * ROUND)
     course.go_on_with(_without_superfluous(course.refinement, problem, clock))
     if course.settles(clock, LOOSENED_IN_VAIN, TRIAL_AFTER * ROUND):
-        course.hold(TIGHTER * course.best_weight)
+        course.hold(course.likely_weight)
     course.go_on_with(_without_doubtful(course.refinement, problem, clock))
     if course.refinement.loosens and course.settles(clock, LOOSENED_IN_VAIN):
-        course.hold(TIGHTER * course.best_weight)
+        course.hold(course.likely_weight)
     while course.settles(clock, PATIENCE):
         if course.recent >= (1 - LEAST_GAIN) * course.before:
             clock.converged()
             break
-        course.hold(course.refinement.parameters.tv_weight / TIGHTER)
+        step = TIGHTER if course.fits_noise else 1 / TIGHTER
+        course.hold(step * course.refinement.parameters.tv_weight)
     return course.at_best()
 
 
 class _Course:
     """A refinement from round to round, and the state that predicted the held-out samples best.
 
-    ``recent`` is the least error since λ was last held, ``before`` that of the time before, ``best_weight``
-    the λ of the best round.
+    ``recent`` is the least error since λ was last held, ``before`` that of the time before; ``fits_noise``
+    tells whether the last round met the used samples more closely than their noise allows, if it is known.
     """
 
     def __init__(self, refinement: Refinement, problem: Problem) -> None:
         self.refinement, self._problem = refinement, problem
-        self.best_weight = refinement.parameters.tv_weight
+        self._noise, self.fits_noise = problem.noise(refinement.segment), False
         self.recent = self.before = np.inf
         self._best, self._kept, self._idle = np.inf, (refinement, refinement.found), 0
+        self._loosened = [(np.inf, refinement.parameters.tv_weight)]
+        self._doubt = SURE / np.sqrt(2 * max(1, problem.held_out.sum()))
 
     def settles(self, clock: IterationClock, patience: int, most: int | None = None) -> bool:
         """Refine until this many rounds in turn gain nothing; False if it ends before, after ``most``."""
@@ -83,19 +91,30 @@ class _Course:
             self.refinement.step()
             if self.refinement.at_round_end:
                 self._judge(weight)
-                if self._idle == patience:
+                in_vain = 1 if self.fits_noise and self.refinement.loosens else patience
+                if self._idle >= in_vain:
                     return True
         return False
 
     def _judge(self, weight: float) -> None:
-        error = self._problem.prediction_error(self.refinement.predict())
+        predicted = self.refinement.predict()
+        error = self._problem.prediction_error(predicted)
+        self.fits_noise = self._problem.misfit(predicted) < self._noise
         # without held-out samples the error is NaN, which never counts as idle
         least_gain = LEAST_GAIN if self.refinement.loosens else LEAST_GAIN_HELD
         self._idle = self._idle + 1 if error >= (1 - least_gain) * self.recent else 0
         self.recent = min(self.recent, error)
         if not error >= self._best:
             self._best, self._kept = error, (self.refinement, self.refinement.found)
-            self.best_weight = weight
+        if self.refinement.loosens:
+            self._loosened.append((error, weight))
+
+    @property
+    def likely_weight(self) -> float:
+        """The λ to hold: `TIGHTER` than the best round's, or the largest that predicted no worse."""
+        least, best_weight = min(self._loosened)
+        as_good = [weight for error, weight in self._loosened if error <= (1 + self._doubt) * least]
+        return max(TIGHTER * best_weight, *as_good)
 
     def hold(self, weight: float) -> None:
         """Continue with this λ, which is no longer lowered."""
