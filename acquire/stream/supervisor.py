@@ -391,9 +391,9 @@ class Supervisor:
                 case Ready():
                     self._succession.ready(name)
                 case Began():
-                    reason = self.life.on_began(message, time.monotonic())
-                    if reason is not None:
-                        self._workers[RECORDER].post(End(reason))
+                    missed = self.life.on_began(message, time.monotonic())
+                    if missed is not None:
+                        self._workers[RECORDER].post(missed)
                 case Refused(error):
                     if self.life.on_refused(message, time.monotonic()):
                         self._last_words[name] = f"the recording cannot go on: {error}"
