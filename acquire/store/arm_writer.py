@@ -50,7 +50,7 @@ class ArmWriter:
 
     @property
     def next_line(self) -> int:
-        return self._first_line + self._pixels.rows
+        return self._first_line + self._pixels.rows  # the last array to be appended to: see `append`
 
     @property
     def written_rows(self) -> int:

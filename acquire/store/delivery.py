@@ -88,8 +88,9 @@ class _LocalDelivery:
 
     def deliver(self) -> None:
         with refused(self._path, "written"):
+            # Contents before the name: after a power failure there is no video, rather than half of one.
             DISK.sync_tree(self.partial)
-            check_new_path(self._path)
+            check_new_path(self._path)  # once more, since `rename` would replace an empty directory
             self.partial.rename(self._path)
             DISK.sync_directory(self._path.parent)
 

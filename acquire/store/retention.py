@@ -255,6 +255,7 @@ def _holds(path: Path) -> Path:
 
 def _copy_hold(path: Path, url: str) -> Path:
     """Return the path of the hold for the lines that a copy has not reached yet."""
+    # One for each URL: a copy to one place must not free lines that another has not got yet.
     return _holds(path) / f"0-copy-{crc32(url.encode()):08x}.json"
 
 
