@@ -51,6 +51,7 @@ class RefusedError(TriggerError):
         super().__init__(f"the trigger refused {where}: {errors.get(code, f'error {code}')}")
 
     def __reduce__(self) -> tuple[object, ...]:
+        # Exceptions are unpickled from their message by default, which `__init__` does not take.
         return type(self), (self.code, self.address)
 
 

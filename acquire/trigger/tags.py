@@ -82,6 +82,7 @@ class TagReader:
         if ahead >= _NUMBERS // 2 and (wrong or tag.line <= self._newest_line):
             self._counts["tags_repeated"] += 1
             return None
+        # Also for a wrong one, which has used up its number: it would count as missing as well.
         self._next = (number + 1) % _NUMBERS
         self._counts["tags_missing"] += ahead
         if wrong:
