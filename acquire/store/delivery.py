@@ -106,7 +106,7 @@ class _FarDelivery:
         self.partial = Path(self._directory.name) / "group.zarr"
 
     def deliver(self) -> None:
-        _check_free(self._target)
+        _check_free(self._target)  # once more: another program may have put something there since
         files = [file for file in self.partial.rglob("*") if file.is_file()]
         # Metadata of arrays first, by which `_check_free` recognises a failed upload; the root last.
         files.sort(key=lambda file: (file == self.partial / ROOT, file.name != ROOT))

@@ -82,6 +82,7 @@ class ShardFile:
         ``path`` may then be a link, as in /proc.
         """
         self._fd = os.open(path, _NEW, 0o666) if fd < 0 else fd
+        # A second descriptor, since the index is less than a page and has to go through the cache.
         self._direct = open_direct(path, follow=fd >= 0) if direct else -1
         self._cached = (0, 0)
 

@@ -227,7 +227,7 @@ def group_document(attributes: Mapping[str, Any], nodes: Mapping[str, Document])
         "attributes": dict(attributes),
         "consolidated_metadata": {
             "kind": "inline",
-            "must_understand": False,
+            "must_understand": False,  # an extension of zarr-python, which other readers may ignore
             "metadata": {path: inner(document) for path, document in nodes.items()},
         },
     }
