@@ -231,8 +231,7 @@ class Mirror:
             here = error.filename is not None and str(error.filename).startswith(str(self.path))
             what = (self.path, error, "read") if here else (self.target, error, "written", _HINT)
             raise refusal(*what) from error
-        # Retention may delete copied lines: those before this one, or all of a sealed recording. Only after
-        # the copy's root, without which nobody finds them there.
+        # Lines are held until the copy's root names them; nothing of a sealed recording is deleted any more.
         line = None if sealed else recording.first_line + lines
         if line is None:
             release(self.path, self._disk)
