@@ -224,7 +224,7 @@ class Supervisor:
                 begun = self._turned_s = time.monotonic()
                 tags = self._take_tags()
                 self._query_trigger(begun)
-                for name, worker in self._workers.items():
+                for name, worker in self._workers.items():  # a successor only replaces the value of a key
                     self._read_messages(name, worker)
                     worker.flush()
                 # A recording that the disk ended continues in a further segment, unless its end has come.
@@ -271,7 +271,7 @@ class Supervisor:
                 self._tags.drop(some[0].line, len(some))
                 continue
             slot.pixels[: len(some)] = tag_rows(some)
-            self._tags.commit(0, len(some))
+            self._tags.commit(0, len(some))  # the rows of this ring are tags, and have no line numbers
         return tags
 
     def _query_trigger(self, now_s: float) -> None:
