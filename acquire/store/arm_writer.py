@@ -41,6 +41,7 @@ class ArmWriter:
                 durable=spec.fsync == "commit",
                 padding=column.fill,
                 disk=disk,
+                # Tags are packed in the caller's thread: `EncodeOnce`, which both arms share, is for one.
                 pool=pool if column.name == "lines" else None,
                 once=once.get(column.name),
             )

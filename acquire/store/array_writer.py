@@ -68,6 +68,7 @@ class ArrayWriter:
         self._is_large = shape.chunk_bytes >= DIRECT_BYTES
         self._behind: ThreadPoolExecutor | None = None
         self._once = once
+        # One is filled, and the others wait for an encoder or for their turn.
         self._free: deque[NDArray[Any]] = deque(_buffer(shape) for _ in range(1 + ahead if pool else 1))
         self._buffer = self._free.popleft()
         self._filled = 0

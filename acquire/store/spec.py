@@ -182,6 +182,7 @@ class RecordingSpec:
             "encoders": (1, 64),
             "commit_lines": (1, 2**40),
             "reserve_bytes": (0, 2**60),
+            # 8 bytes: of the widest tag, of which there is one per line
             "chunk_lines": (1, MAX_CHUNK_BYTES // max(8, self.pixels * self.line_dtype.itemsize)),
         }
         for name, (low, high) in limits.items():
