@@ -101,8 +101,11 @@ class Child:
     def _wait(self, deadline: float) -> bool:
         """Wait for the nursery's next message, or the process's end; return False if neither came in time."""
         sources = [fd for fd in (self._status.fileno(), self._pidfd) if fd >= 0]
+        waiting = select.poll()
+        for source in sources:
+            waiting.register(source, select.POLLIN)
         while sources:
-            ready = _readable(sources, deadline - time.monotonic())
+            ready = {fd for fd, _ in waiting.poll(max(0.0, deadline - time.monotonic()) * 1000)}
             if self._status.fileno() in ready:
                 self._receive()
                 return True
@@ -143,12 +146,14 @@ class Nursery:
         self.modules = modules
         # Sequential packets keep a message together with its descriptors.
         self._channel, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        # The nursery must find the modules that its owner finds, whose path may have been changed since.
         path = os.pathsep.join(entry for entry in sys.path if entry)
         with theirs:
             self._process = subprocess.Popen(  # noqa: S603 - this package
                 [sys.executable, "-c", _START, str(theirs.fileno()), *modules],
                 stdin=subprocess.DEVNULL,
                 pass_fds=(theirs.fileno(),),
+                # OpenBLAS would start threads when numpy is imported, and a forked worker has none of them.
                 env={**os.environ, "PYTHONPATH": path, "OPENBLAS_NUM_THREADS": "1"},
             )
         self.owner = os.getpid()
@@ -184,6 +189,8 @@ class Nursery:
     def close(self) -> None:
         """End the process; workers continue. Idempotent."""
         self._channel.close()
+        # A fork of the owner has a copy of this object, but not the process: it is neither to be killed there
+        # nor can it be waited for.
         if self.owner == os.getpid():
             self._process.kill()  # it has no state that could be lost
             self._process.wait()
@@ -285,13 +292,6 @@ def _pack(parcel: _Parcel, name: str, target: Callable[..., None], args: tuple[A
     return pickle.dumps((place, dict(os.environ), job))
 
 
-def _readable(sources: list[int], timeout_s: float) -> set[int]:
-    waiting = select.poll()
-    for source in sources:
-        waiting.register(source, select.POLLIN)
-    return {source for source, _ in waiting.poll(max(0.0, timeout_s) * 1000)}
-
-
 # ---- the nursery's process
 
 
@@ -331,20 +331,21 @@ def _keep(channel: socket.socket) -> int | None:
             if ready in children:
                 waiting.unregister(ready)
                 pid, status = children.pop(ready)
-                _, ended = os.waitpid(pid, 0)
+                _, ended = os.waitpid(pid, 0)  # at once: a pidfd is readable when its process has ended
                 os.close(ready)
                 with status, contextlib.suppress(OSError):  # the owner may be gone
                     status.send(str(os.waitstatus_to_exitcode(ended)).encode())
                 continue
             _, fds, _, _ = socket.recv_fds(channel, 16, _MOST_FDS, socket.MSG_CMSG_CLOEXEC)
-            if not fds:
+            if not fds:  # the end of the socket: the owner has closed it, or has died
                 return None
             pid = os.fork()
             if pid == 0:
                 return _begin(channel, children, fds)
             status = socket.socket(fileno=fds.pop(0))
+            # Even if the worker has ended already, the number is still its own: nobody else can reap it.
             pidfd = os.pidfd_open(pid)
-            with contextlib.suppress(OSError):
+            with contextlib.suppress(OSError):  # the owner may have given the worker up
                 socket.send_fds(status, [str(pid).encode()], [pidfd])
             for fd in fds:
                 os.close(fd)

@@ -47,6 +47,8 @@ class SharedBytes:
             os.close(self._fd)
 
     def __reduce__(self) -> tuple[Any, ...]:
+        # The descriptor, not the name: the file has no path under which the child could open it. The child's
+        # copy is independent of ours, so that either may close first.
         return _attach, (self.name, self.size, reduction.DupFd(self._fd))
 
 
@@ -66,6 +68,7 @@ class Counters:
         self._words[self._position[name]] = value
 
     def add(self, name: str, value: int) -> None:
+        # Not atomic: correct only because no other process writes this number at the same time.
         self._words[self._position[name]] += value
 
     def close(self) -> None:

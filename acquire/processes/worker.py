@@ -192,7 +192,14 @@ class Worker:
         if self.pipe.closed:
             return
         self.post(Quit())
-        self._await_end(deadline)
+        ran_s = time.monotonic()
+        while self._child.exit_code() is None and (now_s := time.monotonic()) < deadline:
+            if not self.is_stopped:
+                ran_s = now_s
+            elif now_s - ran_s > _STOPPED_WAIT_S:
+                break
+            self.flush()  # the pipe may have had no room for Quit
+            self._child.exit_code(min(deadline - now_s, _LOOK_S))
         forced = self._child.exit_code() is None
         if forced:
             self._child.kill()
@@ -207,17 +214,6 @@ class Worker:
         self._child.close()
         if forced:
             raise DeviceError(f"{self.name}: the process did not end when told to, and was killed")
-
-    def _await_end(self, deadline: float) -> None:
-        """Wait until the process has ended or been stopped for too long, or the monotonic ``deadline``."""
-        ran_s = time.monotonic()
-        while self._child.exit_code() is None and (now_s := time.monotonic()) < deadline:
-            if not self.is_stopped:
-                ran_s = now_s
-            elif now_s - ran_s > _STOPPED_WAIT_S:
-                return
-            self.flush()
-            self._child.exit_code(min(deadline - now_s, _LOOK_S))
 
 
 def become_urgent() -> bool:

@@ -41,6 +41,7 @@ class ArmWriter:
                 durable=spec.fsync == "commit",
                 padding=column.fill,
                 disk=disk,
+                # Tags are packed in the caller's thread: `EncodeOnce`, which both arms share, is for one.
                 pool=pool if column.name == "lines" else None,
                 once=once.get(column.name),
             )
@@ -50,7 +51,7 @@ class ArmWriter:
 
     @property
     def next_line(self) -> int:
-        return self._first_line + self._pixels.rows
+        return self._first_line + self._pixels.rows  # the last array to be appended to: see `append`
 
     @property
     def written_rows(self) -> int:

@@ -52,6 +52,7 @@ class ArrayFiles:
         try:
             data = self._source.read_range(self.shard_file(shard), 0, index_bytes(chunks))
         except FileNotFoundError:
+            # Intact: without a file every chunk is absent for certain, which a torn index does not tell.
             return [(ABSENT, ABSENT)] * chunks, True
         return unpack_index(data, chunks)
 

@@ -68,6 +68,7 @@ class ArrayWriter:
         self._is_large = shape.chunk_bytes >= DIRECT_BYTES
         self._behind: ThreadPoolExecutor | None = None
         self._once = once
+        # One is filled, and the others wait for an encoder or for their turn.
         self._free: deque[NDArray[Any]] = deque(_buffer(shape) for _ in range(1 + ahead if pool else 1))
         self._buffer = self._free.popleft()
         self._filled = 0
@@ -110,6 +111,8 @@ class ArrayWriter:
 
     def give_back(self) -> None:
         """Wait until the rows of the last `append` are written or encoded, and may be reused."""
+        # Without a pool the piece on its way may be the lent rows themselves; with one it is a packed copy,
+        # and the rows are needed only until they are packed.
         if self._pool is None:
             self.finish()
         wait([payload for payload, buffer in self._encoding if buffer is None])
@@ -119,7 +122,7 @@ class ArrayWriter:
         if self._writing is not None:
             (written, piece), self._writing = self._writing, None
             written.result()
-            self._count(piece)
+            self._count(piece)  # not before the result: a piece that failed must not count as written
 
     def pad(self) -> None:
         """Write the rows that wait as one more chunk, filled up with ``padding``."""
@@ -182,6 +185,7 @@ class ArrayWriter:
             self._write([self._encode(self._buffer, self._chunks)])
             return
         self._encoding.append((self._pool.submit(encode, self._buffer, self.shape.codec), self._buffer))
+        # All buffers wait for the encoders: lines come faster than they are packed, and memory is bounded.
         while not self._free:
             self._write([self._encoded()])
         self._buffer = self._free.popleft()
@@ -194,7 +198,7 @@ class ArrayWriter:
     def _write_encoded(self) -> None:
         """Wait for all chunks being encoded, and write them in as few pieces as possible."""
         while self._encoding:
-            self.finish()
+            self.finish()  # a shard that the disk's thread still writes to has not counted its chunks yet
             count = min(self._with_room().room, len(self._encoding))
             self._write([self._encoded() for _ in range(count)])
 
@@ -221,15 +225,14 @@ class ArrayWriter:
         self.bytes_written += sum(piece.sizes)
 
     def _with_room(self) -> ShardWriter:
-        shard = self._shard
-        return shard if shard is not None and shard.room else self._next_shard()
-
-    def _next_shard(self) -> ShardWriter:
+        """Return the shard being written, or the next one if it is full."""
+        if self._shard is not None and self._shard.room:
+            return self._shard
         self.publish()
         if self._durable:
             self.sync()
         self.close()
-        self._shard = None
+        self._shard = None  # the next one may fail to be created, and this one must not be used again
         key = shard_key(self._chunks // self.shape.shard_chunks, len(self.shape.chunk_shape))
         path = self.directory / key
         self.directory.stat()  # raises if the directory was removed: it must not be created again

@@ -52,6 +52,7 @@ def _anything(value: Any) -> None:
 
 
 def _whole(low: int, high: int) -> Check:
+    # `type`, not isinstance: JSON's true is an int to Python, and would pass as 1.
     return lambda value: _check(
         type(value) is int and low <= value <= high, value, f"a whole number from {low} to {high}"
     )

@@ -69,6 +69,7 @@ class ChunkReader(ArrayFiles):
         if len(data) < size or size <= CRC_BYTES:
             raise DamagedChunkError(f"{size - len(data)} of {size} bytes are not there")
         payload = memoryview(data)[:-CRC_BYTES]
+        # The checksum first: `check_size` believes the header.
         if crc32c(payload) != data[-CRC_BYTES:]:
             raise DamagedChunkError("the checksum is wrong")
         try:

@@ -74,6 +74,7 @@ class EncodeOnce:
         packed = self._packed.pop(key, None)
         if packed is None:
             packed = self._packed[key] = encode(rows, codec)
+            # An arm that is further behind packs its own; one that lost lines never asks for this chunk.
             if len(self._packed) > _MOST_KEPT:
                 del self._packed[next(iter(self._packed))]
         return packed

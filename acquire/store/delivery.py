@@ -88,8 +88,9 @@ class _LocalDelivery:
 
     def deliver(self) -> None:
         with refused(self._path, "written"):
+            # Contents before the name: after a power failure there is no video, rather than half of one.
             DISK.sync_tree(self.partial)
-            check_new_path(self._path)
+            check_new_path(self._path)  # once more, since `rename` would replace an empty directory
             self.partial.rename(self._path)
             DISK.sync_directory(self._path.parent)
 
@@ -105,7 +106,7 @@ class _FarDelivery:
         self.partial = Path(self._directory.name) / "group.zarr"
 
     def deliver(self) -> None:
-        _check_free(self._target)
+        _check_free(self._target)  # once more: another program may have put something there since
         files = [file for file in self.partial.rglob("*") if file.is_file()]
         # Metadata of arrays first, by which `_check_free` recognises a failed upload; the root last.
         files.sort(key=lambda file: (file == self.partial / ROOT, file.name != ROOT))

@@ -22,6 +22,7 @@ def check_lengths(recording: Outline) -> None:
     arrays = {f"{arm}/{name}": files.files(name) for arm, files in recording.arms.items() for name in COLUMNS}
     first = arrays[f"{ARMS[0]}/lines"]
     for key, array in arrays.items():
+        # Retention, copies and recovery take the file of the same number of every array for the same lines.
         if array.shape.shard_rows != first.shape.shard_rows:
             raise ValueError(f"files of {key} have other rows than those of {ARMS[0]}/lines")
         if array.rows > MOST_LINES:

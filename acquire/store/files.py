@@ -62,16 +62,10 @@ def write_all(fd: int, parts: Sequence[Buffer], offset: int) -> None:
             raise OSError(errno.EIO, "the disk takes no more bytes")
         offset += written
         left -= written
-        views = _without(views, written)
-
-
-def _without(views: Sequence[memoryview], count: int) -> list[memoryview]:
-    """Return ``views`` without their first ``count`` bytes."""
-    rest = []
-    for view in views:
-        rest.append(view[count:])
-        count -= min(count, len(view))
-    return [view for view in rest if len(view)]
+        # Continue after the bytes that the disk took, which may end within a part.
+        while written >= len(views[0]):
+            written -= len(views.pop(0))
+        views[0] = views[0][written:]
 
 
 class ShardFile:
@@ -88,6 +82,7 @@ class ShardFile:
         ``path`` may then be a link, as in /proc.
         """
         self._fd = os.open(path, _NEW, 0o666) if fd < 0 else fd
+        # A second descriptor, since the index is less than a page and has to go through the cache.
         self._direct = open_direct(path, follow=fd >= 0) if direct else -1
         self._cached = (0, 0)
 
@@ -177,7 +172,7 @@ class Disk:
         self.remove(path)
         fd = os.open(path, _NEW, 0o666)
         try:
-            os.posix_fallocate(fd, 0, size)
+            os.posix_fallocate(fd, 0, size)  # a file that is only made longer would be sparse
         finally:
             os.close(fd)
 

@@ -22,7 +22,7 @@ def this_host() -> dict[str, str]:
     try:
         boot_id = _BOOT_ID.read_text(encoding="ascii").strip()
     except FileNotFoundError:
-        boot_id = ""
+        boot_id = ""  # then no recording counts as written since the start, and recovery checks all of it
     return {"name": platform.node(), "boot_id": boot_id}
 
 

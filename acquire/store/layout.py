@@ -35,8 +35,8 @@ READABLE = ("acquire-recording/1", FORMAT)
 
 DAMAGE = (OSError, ValueError, RuntimeError, LookupError, TypeError, AttributeError, ArithmeticError)
 """Exceptions that zarr and arithmetic raise for wrong metadata or chunks."""
-PARSE_ERRORS = (LookupError, TypeError, ValueError, AttributeError)
-"""Exceptions raised when a wrong document is parsed."""
+PARSE_ERRORS = (LookupError, TypeError, ValueError, AttributeError, ArithmeticError)
+"""Exceptions raised when a wrong document is parsed; arithmetic: a number may be 0, or 1e999, infinite."""
 
 MAX_READ_BYTES = 2**31
 """Largest chunk that a reader takes into memory; chunks that are written are much smaller."""
@@ -227,7 +227,7 @@ def group_document(attributes: Mapping[str, Any], nodes: Mapping[str, Document])
         "attributes": dict(attributes),
         "consolidated_metadata": {
             "kind": "inline",
-            "must_understand": False,
+            "must_understand": False,  # an extension of zarr-python, which other readers may ignore
             "metadata": {path: inner(document) for path, document in nodes.items()},
         },
     }

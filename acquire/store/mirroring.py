@@ -231,7 +231,7 @@ class Mirror:
             here = error.filename is not None and str(error.filename).startswith(str(self.path))
             what = (self.path, error, "read") if here else (self.target, error, "written", _HINT)
             raise refusal(*what) from error
-        # Retention may delete copied lines: those before this one, or all of a sealed recording.
+        # Lines are held until the copy's root names them; nothing of a sealed recording is deleted any more.
         line = None if sealed else recording.first_line + lines
         if line is None:
             release(self.path, self._disk)
@@ -256,7 +256,7 @@ class Mirror:
             run_id, number = self._identity
             facts = {"run_id": run_id} | ({"segment_number": number} if number > 1 else {})
             self._put(MARK, to_json({"attributes": facts}))
-            self._there[MARK] = 0
+            self._there[MARK] = 0  # only that it is there matters, not its size
         while self._next < end and (most is None or self._shards - before < most):
             # Skip shards that retention has dropped in one go: an endless recording has very many.
             dropped = (rows for rows in recording.dropped_rows() if self._next * size in rows)

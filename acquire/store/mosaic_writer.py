@@ -52,6 +52,7 @@ class MosaicWriter(VideoWriter):
         self._time_ns, self.frames, self._side = time_ns, len(time_ns), side
         self._error = np.full((self.frames, tiles[0] * regions, tiles[1] * regions), NOT_THERE, np.float32)
         self._squares = np.zeros((2, self.frames))
+        # Of its full length from the beginning: a tile may be put whole before the next one has a frame.
         with refused(place, "written"):
             self._levels[0].resize((self.frames, *shape))
 

@@ -126,7 +126,7 @@ def _check_complete(recording: Outline) -> None:
         if not all(part and part not in (".", "..") and "\0" not in part for part in path.split("/")):
             raise ValueError(f"{path!r} is not the path of an array or a group")
         _check_object(node["attributes"])
-        node["node_type"]
+        node["node_type"]  # a KeyError, if there is none
     for table in ("gaps", "events"):
         int(recording.document["consolidated_metadata"]["metadata"][table]["attributes"]["not_listed"])
     for arm in recording.arms.values():

@@ -115,6 +115,7 @@ class Outline:
     def first_available_line(self) -> int:
         """The first line that retention has not deleted."""
         line = self.first_line
+        # Only ranges that begin the recording: others lie behind lines that are held.
         for first, count in sorted(self.dropped):
             line = first + count if first == line else line
         return line
@@ -143,6 +144,7 @@ class Outline:
     def lost_rows(self, arm: str, lines: int | None = None) -> list[range]:
         """Return the rows of one arm that are listed in gaps, of the first ``lines`` rows or of all."""
         start, end = self.first_line, self.lines if lines is None else lines
+        # A gap is listed as a whole, and may reach beyond the lines that are committed so far.
         gaps = [
             range(gap.first_line - start, min(end, gap.first_line - start + gap.count))
             for gap in self.gaps

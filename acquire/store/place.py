@@ -24,7 +24,7 @@ def put_bytes(file: Path, data: bytes) -> None:
 def put_copy(file: Path, source: Path) -> None:
     """Replace ``file`` by the bytes of ``source``, a regular file. Raises OSError."""
     scratch = file.with_name(SCRATCH)
-    DISK.remove(scratch)
+    DISK.remove(scratch)  # what a killed copy has left
     with os.fdopen(open_regular(source, follow=False), "rb") as original, scratch.open("xb") as copy:
         shutil.copyfileobj(original, copy, 2**22)
         copy.flush()

@@ -45,7 +45,7 @@ def present_values(
         return values
     try:
         values[present] = stream.read(name, start, start + len(flags))[present]
-    except DataError:
+    except DataError:  # chunks of missing rows may be damaged: read around them
         edges = np.flatnonzero(np.diff(present, prepend=False, append=False))
         for first, end in edges.reshape(-1, 2).tolist():
             values[first:end] = stream.read(name, start + first, start + end)

@@ -6,6 +6,7 @@ Everything is read lazily.
 from __future__ import annotations
 
 import math
+from contextlib import suppress
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -71,22 +72,15 @@ class Recording(Outline):
         return in_words("Recording", str(self), state, **self._holds())
 
     def _repr_html_(self) -> str:
+        """Return a table with both arms side by side, if there is a readable overview."""
         facts = {"run": self.attrs["run_id"], "state": self.attrs["run_condition"] or self.state}
-        return as_table(
-            str(self), {**facts, **self._holds(), "end": self.attrs["end_reason"]}, self._picture()
-        )
-
-    def _picture(self) -> str:
-        """Return both arms side by side, if there is a readable overview."""
-        try:
-            overviews = [found.rows for arm in ARMS if (found := self.overview(arm)) is not None]
-        except DataError:
-            return ""
-        if not overviews:
-            return ""
-        both = np.hstack(overviews)
-        rows, columns = (-(-size // PICTURE_PX) for size in both.shape)
-        return as_picture(both[::rows, ::columns], "both arms, time downwards")
+        picture = ""
+        with suppress(DataError):  # reported when the overview is read
+            if overviews := [found.rows for arm in ARMS if (found := self.overview(arm)) is not None]:
+                both = np.hstack(overviews)
+                rows, columns = (-(-size // PICTURE_PX) for size in both.shape)
+                picture = as_picture(both[::rows, ::columns], "both arms, time downwards")
+        return as_table(str(self), {**facts, **self._holds(), "end": self.attrs["end_reason"]}, picture)
 
     def _holds(self) -> dict[str, str]:
         """Return a description in words, without reading any lines."""

@@ -132,6 +132,7 @@ def recover(
         recording = open_recording(path)  # once more, now that nobody writes it
         done = _Recoverer(recording, path, disk, known).run(progress)
     not_listed = ""
+    # Without the lock: `list_segments` takes that of the run's first recording, which this may be.
     try:
         with contextlib.suppress(StateError):  # another recovery has the first recording, and lists them
             list_segments(path, disk)
@@ -210,7 +211,7 @@ class _Recoverer:
         gaps: dict[str, list[tuple[int, int, str]]] = {"damaged": [], "unlisted": []}
         for chunk in chunks_of(size, [*self.kept, range(self.recording.lines, self.rows)]):
             here = range(chunk * size, min(self.rows, (chunk + 1) * size))
-            lost = found.lost(range(here.start, here.start + size))
+            lost = found.lost(range(here.start, here.start + size))  # a whole chunk, as it is rewritten
             missing = self._flag_chunk(found, chunk, lost)[: len(here)] & ~covered(listed, here)
             lost = lost[: len(here)]
             for cause, rows in (("damaged", missing & lost), ("unlisted", missing & ~lost)):

@@ -55,7 +55,13 @@ def refusal(place: object, error: OSError, doing: str, hint: str = "") -> Acquir
     """
     text = f"{place} cannot be {doing}: {error.strerror or error}"
     if is_url(str(place)):
-        return _far(text, error, hint)
+        kind: type[AcquireError] = StoreError
+        advice = _NETWORK
+        if isinstance(error, FileNotFoundError):
+            kind, advice = PlaceError, "an existing bucket or directory"
+        elif isinstance(error, PermissionError):
+            kind, advice = PlaceError, _RIGHTS
+        return kind(text, hint="; ".join(filter(None, (advice, hint))))
     if error.errno == errno.EIO and doing == "read":
         return DataError(text, hint="a copy of the recording, and the kernel's log for errors of the disk")
     if error.errno in NOT_A_PLACE:
@@ -63,11 +69,3 @@ def refusal(place: object, error: OSError, doing: str, hint: str = "") -> Acquir
     if error.errno in {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}:
         return StoreError(text, hint="free space there, or another disk")
     return StoreError(text, hint=hint or "the kernel's log for errors of the disk")
-
-
-def _far(text: str, error: OSError, hint: str) -> AcquireError:
-    if isinstance(error, FileNotFoundError):
-        return PlaceError(text, hint="; ".join(filter(None, ("an existing bucket or directory", hint))))
-    if isinstance(error, PermissionError):
-        return PlaceError(text, hint="; ".join(filter(None, (_RIGHTS, hint))))
-    return StoreError(text, hint="; ".join(filter(None, (_NETWORK, hint))))

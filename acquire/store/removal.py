@@ -64,6 +64,7 @@ def remove(disk: Disk, path: Path, proof: Unborn | Dropped) -> None:
             files = shard_files(path, shard)
             for file in files:
                 refuse_link(path, file)
+            # Not before all of them are known to be ours: a shard goes from every array, or from none.
             for file in files:
                 disk.remove(file)
             for arm in ARMS:

@@ -62,6 +62,7 @@ def next_segment(path: Path, spec: RecordingSpec, cause: str = "interrupted") ->
 def list_segment(segment: Path, follows: Continuation, disk: Disk = DISK) -> None:
     """List a segment that has begun in the first recording. Raises OSError, DataError and StateError."""
     first = segment.with_name(follows.first)
+    # A recovery of the first recording replaces its root, too: one of the two would be lost.
     with locked(first, "listing a segment of"):
         _name(first, [segment.name], disk)
 

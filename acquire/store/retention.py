@@ -117,7 +117,10 @@ def holds_of(path: Path) -> list[Hold]:
     for file in sorted(_holds(path).glob("[0-9]*.json")):
         try:
             facts = read_object(file, follow=False)
-            found.append(Hold(int(facts["first_line"]), int(facts["count"]), str(facts["why"])))
+            held = Hold(int(facts["first_line"]), int(facts["count"]), str(facts["why"]))
+            if min(held.first_line, held.count) < 0:  # listed in the root, it would make that invalid
+                raise ValueError(f"it is for {held.count} lines from line {held.first_line}")
+            found.append(held)
         except FileNotFoundError:
             continue  # replaced by a wider one, or released, in the meantime
         except (*PARSE_ERRORS, OSError) as error:
@@ -255,6 +258,7 @@ def _holds(path: Path) -> Path:
 
 def _copy_hold(path: Path, url: str) -> Path:
     """Return the path of the hold for the lines that a copy has not reached yet."""
+    # One for each URL: a copy to one place must not free lines that another has not got yet.
     return _holds(path) / f"0-copy-{crc32(url.encode()):08x}.json"
 
 

@@ -89,6 +89,7 @@ def pack_index(entries: Sequence[tuple[int, int]]) -> bytes:
 
 def unpack_index(data: bytes, chunks: int) -> tuple[list[tuple[int, int]], bool]:
     """Return offset and size of every chunk (ABSENT if missing), and whether the checksum agrees."""
+    # One that is cut short is filled up with absent chunks, and its checksum is wrong.
     page = data[: index_bytes(chunks)].ljust(index_bytes(chunks), b"\xff")
     entries, checksum = page[:-CRC_BYTES], page[-CRC_BYTES:]
     return list(struct.iter_unpack("<QQ", entries)), small_crc32c(entries) == checksum

@@ -87,6 +87,7 @@ class ShardWriter:
         """Write chunks, to be published later; all at once, since one large write is faster than many."""
         write = self._file.write_pages if self._in_pages else self._file.write
         write(piece.parts, self._end)
+        # Only now: a piece that could not be written has no entry, and the next one takes its place.
         ends = list(accumulate(map(page_up, piece.sizes), initial=self._end))
         new = slice(self.chunks, self.chunks + len(piece.sizes))
         self._index[new] = zip(ends, piece.sizes, strict=False)  # the last end is where the next one begins

@@ -96,7 +96,7 @@ def _absent(array: ArrayFiles, rows: range) -> Iterator[range]:
     start = None
     for chunk in range(rows.start // size, -(-rows.stop // size)):
         entry = entries[chunk % array.shape.shard_chunks]
-        if not intact or ABSENT in entry or sum(entry) > there:
+        if not intact or ABSENT in entry or sum(entry) > there:  # offset and size: where it ends
             start = max(rows.start, chunk * size) if start is None else start
         elif start is not None:
             yield range(start, chunk * size)

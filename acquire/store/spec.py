@@ -136,6 +136,7 @@ class RecordingSpec:
     @property
     def durability(self) -> Durability:
         """The largest possible loss of this recording."""
+        # A line is whole once its tags are on disk, too, and a chunk of tags spans `tag_chunks` of pixels.
         held = self.chunk_lines * max(self.tag_chunks, 1 if self.codec == "none" else 1 + ENCODED_AHEAD)
         committed = self.commit_lines + held if self.fsync == "commit" else None
         return Durability(self.fsync, held, committed)
@@ -181,6 +182,7 @@ class RecordingSpec:
             "encoders": (1, 64),
             "commit_lines": (1, 2**40),
             "reserve_bytes": (0, 2**60),
+            # 8 bytes: of the widest tag, of which there is one per line
             "chunk_lines": (1, MAX_CHUNK_BYTES // max(8, self.pixels * self.line_dtype.itemsize)),
         }
         for name, (low, high) in limits.items():

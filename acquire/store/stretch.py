@@ -41,7 +41,7 @@ class Stretch:
 
     def expect(self) -> None:
         """Start fetching the chunks."""
-        with suppress(OSError):
+        with suppress(OSError):  # `read` reports it
             self._places = self._reader.places(self._chunks)
             for chunk, place in self._places.items():
                 self._reader.expect(chunk, *place)

@@ -41,7 +41,7 @@ class Vocabulary:
 
     def value(self, name: str) -> int:
         """Return the value of ``name``, which is assigned at its first use."""
-        word = "_".join(name.split()) or "other"
+        word = "_".join(name.split()) or "other"  # CF separates the meanings by blanks
         if word not in self._names:
             if len(self._names) >= self._limit:
                 return 0
@@ -110,6 +110,7 @@ class Table:
         for column in self._columns:
             place = self.directory / column.name
             if len(self):
+                # A Zarr chunk has one size: it is filled up to the capacity, and only the length grows.
                 cells = self._cells[column.name]
                 if column.data_type == "string":
                     padding = [""] * (self.capacity - len(self))

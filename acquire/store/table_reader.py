@@ -18,6 +18,7 @@ if TYPE_CHECKING:
 NUMBERS = {"uint8": "B", "uint64": "Q"}
 """Data type of cells → format character of `struct`."""
 MOST_ROWS = 2**20
+"""Limit on what a root may claim: far above the capacity of a table."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -143,7 +143,7 @@ def _read_tags(recording: Recording, found: ArmScan) -> tuple[int | None, int]:
         # Chunk by chunk: the tags of a recording of days do not fit into memory.
         missing = missing_rows(found.stream.reader("flags").chunk(chunk)[:rows])
         flagged += int(missing.sum())
-        first = recording.first_line + chunk * found.stream.reader("flags").shape.chunk_rows
+        first = recording.first_line + chunk * size
         expected = recording.substeps * np.arange(first, first + rows, dtype=np.uint64)
         wrong = found.stream.reader("code_index").chunk(chunk)[:rows] != expected
         misnumbered += int((wrong & ~missing).sum())

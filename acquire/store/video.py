@@ -141,7 +141,18 @@ def write_video(
     image appears whole or not at all. Raises UsageError for an impossible video, before anything is changed,
     and StoreError if the disk refuses.
     """
-    _check(video, time_ns, pixel_size, frame_interval_ns, provenance)
+    if video.ndim != 3 or video.size == 0 or video.dtype.name not in DTYPES:
+        raise UsageError(
+            f"a video cannot be {video.dtype} {video.shape}", possible=f"(t, y, x) of {', '.join(DTYPES)}"
+        )
+    if time_ns.shape != video.shape[:1] or time_ns.dtype != np.int64:
+        raise UsageError(
+            f"time stamps cannot be {time_ns.dtype} {time_ns.shape}", possible=f"int64 ({len(video)},)"
+        )
+    for name, value in (("pixel size", pixel_size), ("frame interval", frame_interval_ns)):
+        if not (math.isfinite(value) and value > 0):
+            raise UsageError(f"a video cannot have a {name} of {value}", possible="a finite number above 0")
+    check_provenance(provenance)  # `finish` checks it as well, but only once the frames are written
     rows, columns = video.shape[1:]
     grid = VideoGrid((frame_interval_ns * 1e-9, pixel_size, pixel_size), origin, pixel_unit)
     with VideoWriter(place, (rows, columns), video.dtype, grid) as writer:
@@ -184,24 +195,3 @@ def open_video(place: Path | str) -> VideoFile:
         raise PlaceError(f"{source} is not a video: it is not a Zarr group", hint=_VIDEO) from error
     except DAMAGE as error:
         raise DataError(f"{source} is not a video, or is damaged: {error}") from error
-
-
-def _check(
-    video: NDArray[Any],
-    time_ns: NDArray[np.int64],
-    pixel_size: float,
-    frame_interval_ns: float,
-    provenance: Mapping[str, Any],
-) -> None:
-    if video.ndim != 3 or video.size == 0 or video.dtype.name not in DTYPES:
-        raise UsageError(
-            f"a video cannot be {video.dtype} {video.shape}", possible=f"(t, y, x) of {', '.join(DTYPES)}"
-        )
-    if time_ns.shape != video.shape[:1] or time_ns.dtype != np.int64:
-        raise UsageError(
-            f"time stamps cannot be {time_ns.dtype} {time_ns.shape}", possible=f"int64 ({len(video)},)"
-        )
-    for name, value in (("pixel size", pixel_size), ("frame interval", frame_interval_ns)):
-        if not (math.isfinite(value) and value > 0):
-            raise UsageError(f"a video cannot have a {name} of {value}", possible="a finite number above 0")
-    check_provenance(provenance)

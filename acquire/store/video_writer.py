@@ -105,6 +105,7 @@ class VideoWriter:
         self._chunk.append((video, *columns))
         self._window.add(video)
         self.frames += len(video)
+        # Part of a chunk waits: with the next frames, zarr would have to read it again and pack it once more.
         if sum(len(part[0]) for part in self._chunk) >= self._levels[0].chunks[0]:
             self._flush(whole_chunks=True)
 

@@ -151,6 +151,7 @@ class RecordingWriter:
             with self._failing("creating the recording", StoreError):
                 self._publish_copy()
                 self._publish_root(0, self._publish_parts(0, own=False))  # `prepare` did the slow part
+                # After the root: the first recording must not list a segment that does not exist.
                 if self.spec.continues is not None and self.spec.continues.listed:
                     list_segment(self.path, self.spec.continues, self._disk)
         except AcquireError:
@@ -164,6 +165,7 @@ class RecordingWriter:
 
     def _create_parts(self) -> None:
         with self._failing("creating the recording", StoreError):
+            # Before there are parts: with them, and without a root, it looks like one whose root was lost.
             self._lock = lock(self.path, "recording to")
             for arm in self._arms.values():
                 arm.create()
@@ -315,7 +317,7 @@ class RecordingWriter:
                 rows = min(arm.next_line for arm in self._arms.values()) - self.spec.first_line
                 for arm in self._arms.values():
                     arm.pad()
-            self._disk.remove(self._reserve)
+            self._disk.remove(self._reserve)  # its room is for what follows: the disk may be full
             self._disk.sync_tree(self.path)  # lines before their metadata
             nodes = self._publish_parts(rows, own=True) | self._publish_overview(rows)
             self._disk.sync_tree(self.path)  # metadata before the root
@@ -341,6 +343,7 @@ class RecordingWriter:
     def close(self) -> None:
         """Close all files; uncommitted lines are dropped. Idempotent."""
         self._closed = True
+        # The threads first: they write to the files that are closed next.
         for threads in (self._pool, self._behind):
             if threads is not None:
                 threads.shutdown(cancel_futures=True)
@@ -394,7 +397,7 @@ class RecordingWriter:
         root = layout.group_document(self._attributes(ending), nodes)
         durable = self._durable or ending is not None
         self._publisher.replace(self.path / "zarr.json", layout.to_json(root), durable=durable)
-        self._committed = rows
+        self._committed = rows  # only now: nothing is acknowledged that a reader would not find
 
     def _publish_copy(self, ending: Ending | None = None) -> None:
         """Write the copy of the root's attributes, in case the root is lost; always before the root."""

@@ -76,7 +76,7 @@ class Capture:
         self._pulses: int | None = None
         self._workers: dict[str, Worker] = {}
         self._supervisor: Supervisor | None = None
-        self._memory = threading.Lock()
+        self._memory = threading.Lock()  # held by `poll` while it reads, and to unmap
         self._final: CaptureStatus | None = None
         self._used = self._closed = self._emptied = False
 

@@ -220,6 +220,7 @@ class Intake:
                 self._counters[name] = value
         count = len(block.flags)
         preroll = min(max(-first, 0), count)
+        # Before they are put: `settle_books` corrects these counts if this process is killed in between.
         self._counters.add("delivered", count)
         self._counters.add("preroll", preroll)
         # A frame may have more lines than a slot: the camera sets its height, the rig the slot's.

@@ -26,6 +26,7 @@ class Kept:
     def add(self, first: int, end: int) -> None:
         """Add ``first .. end - 1`` to the recording; calls come in the order of the lines."""
         begun, reached = self._ranges[-1]
+        # A range that is still empty begins with the first line added, not where `begin` would have let it.
         self._ranges[-1] = (begun if reached > begun else first), end
 
     def end_at(self, line: int) -> None:
@@ -41,5 +42,5 @@ class Kept:
             lines = range(max(start, first), min(stop, end))
             if lines:
                 held += len(lines)
-                first = lines.stop
+                first = lines.stop  # ranges overlap if a recording began with lines of an earlier one
         return held

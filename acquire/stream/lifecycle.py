@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING
 
 from acquire.errors import DeviceError, StateError
 from acquire.lines import ARMS
-from acquire.stream.messages import Refused
+from acquire.stream.messages import End, Extend, Refused
 from acquire.stream.succession import Orphan, Resumption, continuation, once_more, resumed
 
 if TYPE_CHECKING:
@@ -218,14 +218,21 @@ class Lifecycle:
 
     # ---- the recorder's messages
 
-    def on_began(self, began: Began, now_s: float) -> str | None:
-        """Note that the recording exists. Return the reason if it is to end at once all the same."""
+    def on_began(self, began: Began, now_s: float) -> End | Extend | None:
+        """Note that the recording exists. Return the command that it missed while it was being created."""
         self._go(Event.BEGAN)
         assert self._begin is not None
-        self.began, self.sealed, self._cut_short = began, None, None
+        before, self.began, self.sealed, self._cut_short = self.began, began, None, None
         self.path = self._begin.path
         self.resumption.began(now_s)
-        return self._end_reason
+        if self._end_reason is not None:
+            return End(self._end_reason)
+        # The end is the one that was known when the segment was requested; it may have been put off since.
+        wanted = before.end_line if before is not None else None
+        if wanted is None or began.end_line is None or wanted <= began.end_line:
+            return None
+        self.began = replace(began, end_line=wanted)
+        return Extend(wanted)
 
     def on_refused(self, refused: Refused, now_s: float) -> bool:
         """Note that it, or its further segment, was refused. Return whether the recording is lost by that."""

@@ -144,8 +144,9 @@ class Judge:
             return found
         # Each arm is predicted from the other: it is enough that one of them is saturated.
         saturated = max(sight.saturated for sight in sights.values()) > _MOST_SATURATED
-        # The run has no code before line 0.
-        if not saturated and not _repeats(bits[reach:], span):
+        # The run has no code before line 0. Does what there is repeat while charge crosses the sensor?
+        code = bits[reach:]
+        if not saturated and not any(np.array_equal(code[n:], code[:-n]) for n in range(1, span)):
             return found
         return {
             arm: finding if finding.verdict is Verdict.VERIFIED else Finding(Verdict.UNKNOWN)
@@ -214,11 +215,6 @@ def _read(peaks: NDArray[np.float64], nominal: int, contrast: float, lines: int)
         return Finding(Verdict.DARK, 0, peak)
     certain = min(contrast, 1.0) * np.sqrt(lines) > _MUST_SHOW
     return Finding(Verdict.WRONG_CODE if certain else Verdict.UNKNOWN, 0, peak)
-
-
-def _repeats(bits: NDArray[np.uint8], within: int) -> bool:
-    """Return whether the code has a period shorter than this number of sub-steps."""
-    return any(np.array_equal(bits[period:], bits[:-period]) for period in range(1, within))
 
 
 def _transform_size(length: int) -> int:

@@ -53,6 +53,7 @@ class Notes:
 
         They are preceded by the doubts about an arm's code that arose earlier and still hold at that line.
         """
+        # By arm, in whose name these kinds end; a later verdict takes the place of an earlier one.
         latest = {note.kind[-1]: note for note in self._notes if is_verdict(note, before=first_line)}
         doubts = [note for note in latest.values() if note.kind in DOUBTFUL.values()]
         return [*(replace(note, line=first_line) for note in doubts), *self._notes]

@@ -36,6 +36,7 @@ class ForeignBytes(SharedBytes):
                 f"the lines cannot be read: {path}: {error.strerror}",
                 hint="run as the daemon's user, on its host, with no fewer capabilities than it has",
             ) from error
+        # The path names a number of the owner's, which may stand for another file by now.
         if os.fstat(self._fd).st_size != size:
             os.close(self._fd)
             raise DeviceError(f"the lines cannot be read: {path} is not the memory of this ring")
@@ -68,6 +69,7 @@ class Peek:
         """Return the next block, or None if there is none now; the same one until `took`."""
         slots = self._ring.shape.slots
         while (head := self._ring.head) > self._number:
+            # As in `Observer.acquire`: the oldest of all slots is the producer's next, and too late to read.
             waiting = head - self._number
             block = self._ring.read(self._number) if waiting < slots else None
             if block is not None:

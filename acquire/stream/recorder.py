@@ -153,6 +153,7 @@ class Recorder:
         if self._busy:
             return
         self._waiting.poll(_WAIT_S * 1000)
+        # Before the next turn takes the blocks: a bell that is rung from now on ends the next wait.
         for ring in (self._tags, *(arm.ring for arm in self._arms.values())):
             ring.hush()
 

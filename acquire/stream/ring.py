@@ -197,7 +197,7 @@ class Ring:
         self._control[_NEWEST] = first_line + count
         self._control[_PEAK] = max(self._control[_PEAK], head + 1 - self._control[_TAIL])
         self._control[_HEAD] = head + 1  # last: a producer killed before this has handed over nothing
-        os.eventfd_write(self._bell, 1)
+        os.eventfd_write(self._bell, 1)  # after the head: whoever it wakes must find the block
 
     def drop(self, first_line: int, lines: int) -> None:
         """Count a block that found the ring full."""
@@ -209,8 +209,13 @@ class Ring:
 
     def acquire(self, timeout_s: float = 0.0) -> RingBlock | None:
         """Return the oldest block, or None if none came within ``timeout_s``; the same one until released."""
-        if not self._wait(timeout_s):
-            return None
+        deadline = time.monotonic() + timeout_s
+        # The counts decide, not the bell, which may have been rung for a block that was taken already.
+        while self._control[_HEAD] == self._control[_TAIL]:
+            remaining_s = deadline - time.monotonic()
+            if remaining_s <= 0 or not self._ringing.poll(remaining_s * 1000):
+                return None
+            os.eventfd_read(self._bell)
         tail = self._control[_TAIL]
         block = self.read(tail)
         if block is None:
@@ -381,7 +386,7 @@ class Ring:
         """Release the memory; the other processes keep theirs. Idempotent."""
         if self._bell < 0:
             return
-        self._slots.clear()
+        self._slots.clear()  # memory can only be unmapped once there are no views of it
         for words in (*self._headers, self._control):
             words.release()
         self._memory.close()
@@ -390,16 +395,6 @@ class Ring:
 
     def __reduce__(self) -> tuple[Any, ...]:
         return _attach, (self.name, self.shape, self._memory, reduction.DupFd(self._bell))
-
-    def _wait(self, timeout_s: float) -> bool:
-        deadline = time.monotonic() + timeout_s
-        # The counts decide, not the bell, which may have been rung for a block that was taken already.
-        while self._control[_HEAD] == self._control[_TAIL]:
-            remaining_s = deadline - time.monotonic()
-            if remaining_s <= 0 or not self._ringing.poll(remaining_s * 1000):
-                return False
-            os.eventfd_read(self._bell)
-        return True
 
     def _oldest(self) -> int:
         return int(max(0, self._control[_HEAD] - self.shape.history_slots))

@@ -377,6 +377,7 @@ class Session:
         return {reason: count for reason, count in reasons.items() if count > 0}
 
     def _ledger(self) -> dict[str, Any]:
+        # A recording that the disk ended may have had no end line yet.
         end = min(self.end_line, max(book.next_line for book in self.books.values()))
         lines = end - self.first_line
         arms = {arm: book.to_attrs(lines) for arm, book in self.books.items()}

@@ -85,6 +85,7 @@ class Supervisor:
         self._events: deque[Note] = deque(maxlen=_MOST_EVENTS)
         self._dead: set[str] = set()
         self._hung: str | None = None
+        self._interruption: Interrupt | None = None
         self._last_words: dict[str, str] = {}
         self._news = threading.Condition()  # its lock is re-entrant: `_note` may call `_fail`
         self._ending = threading.Event()
@@ -179,7 +180,8 @@ class Supervisor:
         """Have the recording end at once, without a further segment."""
         with self._news:
             self._cancel_if(begins=self.life.on_fault())
-        self._workers[RECORDER].post(Interrupt(reason, ARMS, Cause.INTERRUPTED))
+            self._interruption = Interrupt(reason, ARMS, Cause.INTERRUPTED)
+            self._workers[RECORDER].post(self._interruption)
 
     def extend(self, line: int) -> None:
         """Do not let the recording end before ``line``, unless it is ending already."""
@@ -222,7 +224,7 @@ class Supervisor:
                 begun = self._turned_s = time.monotonic()
                 tags = self._take_tags()
                 self._query_trigger(begun)
-                for name, worker in self._workers.items():
+                for name, worker in self._workers.items():  # a successor only replaces the value of a key
                     self._read_messages(name, worker)
                     worker.flush()
                 # A recording that the disk ended continues in a further segment, unless its end has come.
@@ -269,7 +271,7 @@ class Supervisor:
                 self._tags.drop(some[0].line, len(some))
                 continue
             slot.pixels[: len(some)] = tag_rows(some)
-            self._tags.commit(0, len(some))
+            self._tags.commit(0, len(some))  # the rows of this ring are tags, and have no line numbers
         return tags
 
     def _query_trigger(self, now_s: float) -> None:
@@ -364,23 +366,26 @@ class Supervisor:
         successor = self._succession.successor(name)
         if successor is None:
             return False
-        # Under the lock, so that no note is sent to the dead process any more. Marks that were acknowledged
-        # and not yet written are sent again: in a night with 48 kills, 11 of 254 were lost otherwise.
+        # In one go: what comes before belongs to the dead process, and what comes after, such as a start, to
+        # its successor.
         with self._news:
             self._workers[name] = successor
-            for note in self.life.notes if name == RECORDER else ():
-                successor.post(note)
-        worker.end(time.monotonic())
+            if name == RECORDER:
+                # Marks that were acknowledged and not yet written are sent again: in a night with 48 kills,
+                # 11 of 254 were lost otherwise.
+                for note in self.life.notes:
+                    successor.post(note)
+                following = self.life.on_killed(death, self._committed_lines, time.monotonic())
+                if following is not None:
+                    successor.post(following)
+                if self._interruption is not None:  # the dead process may have been the only one to get it
+                    successor.post(self._interruption)
+                self._news.notify_all()
+        worker.end(time.monotonic())  # it is dead: this closes what belonged to it
         self._hung = None
         for arm in self._arms_of.get(name, ()):
             self._cameras[arm].revive()
         self._loop.revive()
-        if name == RECORDER:
-            with self._news:
-                following = self.life.on_killed(death, self._committed_lines, time.monotonic())
-                self._news.notify_all()
-            if following is not None:
-                successor.post(following)
         newest = max(self._counters[arm]["next_line"] for arm in ARMS)
         self.report(replacement_note(worker.name, death, max(newest, 0)))
         return True
@@ -391,9 +396,9 @@ class Supervisor:
                 case Ready():
                     self._succession.ready(name)
                 case Began():
-                    reason = self.life.on_began(message, time.monotonic())
-                    if reason is not None:
-                        self._workers[RECORDER].post(End(reason))
+                    missed = self.life.on_began(message, time.monotonic())
+                    if missed is not None:
+                        self._workers[RECORDER].post(missed)
                 case Refused(error):
                     if self.life.on_refused(message, time.monotonic()):
                         self._last_words[name] = f"the recording cannot go on: {error}"

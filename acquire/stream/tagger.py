@@ -93,29 +93,24 @@ class Tagger:
         lines = rows[:, 0]
         code_index = lines * np.uint64(self._run.substeps)
         expected = np.stack([lines, code_index, code_index * np.uint64(self._run.substep_ticks)], axis=1)
-        if self._all_right(rows, expected):
+        # The common case, all tags as predicted and in order, at a fraction of the cost.
+        numbers = lines.tolist()
+        ahead = all(before < line for before, line in pairwise((self._last_line, *numbers)))
+        if ahead and not self._restarted and np.array_equal(rows, expected):
+            self._last_line = numbers[-1] if numbers else self._last_line
+            self.confirmed_end = self._last_line + 1
             return []
         wrong = (rows != expected).any(axis=1)
         right = np.flatnonzero(~wrong)
         counted = rows[right, 0].astype(np.int64)  # signed, since the line before the first is -1
         back = np.diff(counted, prepend=self._last_line) <= 0
-        ahead = counted[~np.logical_or.accumulate(back)]
-        if len(ahead) and not self._restarted:
-            self._last_line = int(ahead[-1])
+        certain = counted[~np.logical_or.accumulate(back)]
+        if len(certain) and not self._restarted:
+            self._last_line = int(certain[-1])
             self.confirmed_end = self._last_line + 1
         self._restarted |= bool(back.any())
         suspects = np.union1d(np.flatnonzero(wrong), right[back])
         return [TagMismatch(LineTag(*map(int, rows[k])), LineTag(*map(int, expected[k]))) for k in suspects]
-
-    def _all_right(self, rows: NDArray[np.uint64], expected: NDArray[np.uint64]) -> bool:
-        """Handle the common case at a fraction of the cost: all tags as predicted and in order."""
-        lines = rows[:, 0].tolist()
-        ahead = all(before < line for before, line in pairwise((self._last_line, *lines)))
-        if self._restarted or not ahead or not np.array_equal(rows, expected):
-            return False
-        self._last_line = lines[-1] if lines else self._last_line
-        self.confirmed_end = self._last_line + 1
-        return True
 
     def tag(self, block: LineBlock) -> TaggedBlock:
         """Return the block with code and time; lines that no tag has confirmed so far are flagged."""

@@ -91,6 +91,7 @@ def hold(window: Window, rings: Mapping[str, Ring]) -> Held:
         return Held(at, there, {})
     wanted = max(at - window.pre_lines, 0)
     taken = {name: ring.lease(wanted) for name, ring in rings.items()}
+    # Once more: until they were taken back, the cameras could overwrite the oldest blocks.
     whole_from = _whole_from(window, rings, {name: ring.acquire() for name, ring in rings.items()})
     return Held(at, whole_from, taken)
 

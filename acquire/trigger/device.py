@@ -68,8 +68,25 @@ class Device:
     """
 
     def __init__(self, link: Link) -> None:
+        """Read the constants, and compare versions: the error names both."""
         self.link = link
-        self.capabilities = _shake_hands(link)
+        last = r.QUEUES
+        values = _values(r.ID.address, link.read(r.ID.address, last.address + last.words))
+        name = link.transport.name
+        # What it is comes first: the words of another device have no meaning as versions.
+        if values[r.ID] != r.DEVICE_ID:
+            raise TriggerError(
+                f"{name} answers with ID {values[r.ID]:#010x}, not the trigger's {r.DEVICE_ID:#010x}",
+                hint="is it the trigger's port?",
+            )
+        theirs = r.VERSION.protocol.of(values[r.VERSION])
+        if (theirs, values[r.MAP]) != (r.PROTOCOL_VERSION, r.MAP_CRC):
+            raise TriggerError(
+                f"{name} has protocol {theirs} with register map {values[r.MAP]:#010x}, "
+                f"this program protocol {r.PROTOCOL_VERSION} with map {r.MAP_CRC:#010x}",
+                hint="load the firmware that belongs to this program",
+            )
+        self.capabilities = Capabilities.read(values)
         link.window_bytes = self.capabilities.rx_bytes
 
     def read(self, register: Register) -> int:
@@ -185,26 +202,6 @@ class Device:
 def facts_of(status: DeviceStatus | Capabilities) -> dict[str, Any]:
     """Return values for printing, with names instead of numbers."""
     return {name: getattr(value, "name", value) for name, value in asdict(status).items()}
-
-
-def _shake_hands(link: Link) -> Capabilities:
-    """Read the constants. Raises TriggerError, naming both versions, if device and program do not match."""
-    last = r.QUEUES
-    values = _values(r.ID.address, link.read(r.ID.address, last.address + last.words))
-    name = link.transport.name
-    if values[r.ID] != r.DEVICE_ID:
-        raise TriggerError(
-            f"{name} answers with ID {values[r.ID]:#010x}, not the trigger's {r.DEVICE_ID:#010x}",
-            hint="is it the trigger's port?",
-        )
-    theirs = r.VERSION.protocol.of(values[r.VERSION])
-    if (theirs, values[r.MAP]) != (r.PROTOCOL_VERSION, r.MAP_CRC):
-        raise TriggerError(
-            f"{name} has protocol {theirs} with register map {values[r.MAP]:#010x}, "
-            f"this program protocol {r.PROTOCOL_VERSION} with map {r.MAP_CRC:#010x}",
-            hint="load the firmware that belongs to this program",
-        )
-    return Capabilities.read(values)
 
 
 def _values(address: int, words: Sequence[int]) -> dict[Register, int]:

@@ -51,6 +51,7 @@ class RefusedError(TriggerError):
         super().__init__(f"the trigger refused {where}: {errors.get(code, f'error {code}')}")
 
     def __reduce__(self) -> tuple[object, ...]:
+        # Exceptions are unpickled from their message by default, which `__init__` does not take.
         return type(self), (self.code, self.address)
 
 
@@ -161,8 +162,24 @@ class Dialogue:
         for frame in self._decoder.feed(data):
             if frame.type == FrameType.TAG and len(frame.payload) == TAG_BYTES:
                 tags.append(TagArrival(frame.sequence, unpack_tag(frame.payload)))
-            else:
-                self._take_answer(frame, now_s)
+                continue
+            call = self._on_the_way.get(frame.sequence)
+            if call is None or not answers(call.frame, frame):
+                self._counts["unexpected"] += 1
+                continue
+            # The device answers in order: requests sent before without an answer are lost.
+            lost = []
+            # A dict keeps the order of insertion, here of sending.
+            for number, earlier in list(self._on_the_way.items()):
+                del self._on_the_way[number]
+                if earlier is call:
+                    break
+                lost.append(earlier)
+            self._counts["lost"] += len(lost)
+            call.answer = frame
+            self._progress_s = now_s
+            self.longest_s = max(self.longest_s, now_s - call.begun_s)
+            self._send_again(lost)
         return tags
 
     def expire(self, now_s: float) -> bool:
@@ -207,26 +224,6 @@ class Dialogue:
         if call.attempts == self._attempts:
             others_s = min(others_s, call.begun_s + self.limit_s)
         return max(call.sent_s + self.reply_s, others_s)
-
-    def _take_answer(self, frame: Frame, now_s: float) -> None:
-        """Settle the answer's call; calls sent before it will not be answered any more."""
-        call = self._on_the_way.get(frame.sequence)
-        if call is None or not answers(call.frame, frame):
-            self._counts["unexpected"] += 1
-            return
-        # The device answers in order: requests sent before without an answer are lost.
-        lost = []
-        # A dict keeps the order of insertion, here of sending.
-        for number, earlier in list(self._on_the_way.items()):
-            del self._on_the_way[number]
-            if earlier is call:
-                break
-            lost.append(earlier)
-        self._counts["lost"] += len(lost)
-        call.answer = frame
-        self._progress_s = now_s
-        self.longest_s = max(self.longest_s, now_s - call.begun_s)
-        self._send_again(lost)
 
     def _send_again(self, calls: list[Call]) -> None:
         """Queue calls again, oldest first, before all unsent ones; give up those without attempts left."""

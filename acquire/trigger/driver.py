@@ -82,7 +82,7 @@ class TriggerDriver:
     def __init__(self, open_transport: Callable[[], Transport], config: TriggerConfig) -> None:
         self._open_transport = open_transport
         self._config = config
-        self._lock = threading.RLock()
+        self._lock = threading.RLock()  # `prepare` and `close` call `stop`
         self._stopped = threading.Condition()
         self._device: Device | None = None
         self._prepared: TriggerRun | None = None
@@ -155,6 +155,7 @@ class TriggerDriver:
 
     def tags(self, timeout_s: float) -> list[LineTag]:
         """Return the tags of lines since the last call; a stop ends the wait, a watchdog shortens it."""
+        # Without the lock, here as well: `stop` needs it, and ends both waits below.
         device, tags = self._device, self._tags
         if device is None or tags is None:
             if device is not None and device.link.dead is not None:
@@ -180,6 +181,7 @@ class TriggerDriver:
             # Noted before the link is used: if it fails, the next `prepare` ends this run first.
             self._owed = run_number(run.run_id) if run else 0
             device = self._living()
+            # 0, any run: a device that was restarted in the meantime would refuse to stop one that it lacks.
             device.command(Command.STOP, 0)
             # The device ends after a whole line, which may take longer than any answer.
             period_ticks = run.line_period_ticks if run else 0
@@ -223,7 +225,7 @@ class TriggerDriver:
                 try:
                     self._device = Device(link)
                 except TriggerError:
-                    link.close()
+                    link.close()  # its thread would go on reading, and its port would stay locked
                     raise
             if self._device.link.dead is not None:
                 raise self._device.link.dead

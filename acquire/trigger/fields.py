@@ -63,7 +63,7 @@ class Register:
 
     def __getattr__(self, name: str) -> Field:
         """``STATUS.state`` is the field of that name."""
-        if name.startswith("_"):
+        if name.startswith("_"):  # copying and pickling look for special methods, which are no fields
             raise AttributeError(name)
         return self.field(name)
 

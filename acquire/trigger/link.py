@@ -114,13 +114,13 @@ class Link:
                     if self._dead:
                         raise self._dead
                     if dialogue.expire(time.monotonic()):
-                        self._news.notify_all()
+                        self._news.notify_all()  # it may have given up the calls of others, too
                     if are_settled(calls):
                         return results(calls)
         finally:
             with self._news:
                 dialogue.forget(calls)
-                self._news.notify_all()
+                self._news.notify_all()  # calls that are forgotten leave room for those of others
 
     def tags(self, timeout_s: float) -> list[TagArrival]:
         """Return the tags since the last call; wait up to ``timeout_s`` for the first, or for `interrupt`."""

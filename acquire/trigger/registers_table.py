@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import inspect
 import re
+from itertools import accumulate
 from typing import TYPE_CHECKING
 
 from acquire.trigger import registers
@@ -73,6 +74,8 @@ def protocol_markdown() -> str:
         "flags": TagFlag,
         "errors": ErrorCode,
     }
+    starts = accumulate((bits // 8 for _, bits in TAG_FIELDS), initial=0)
+    fields = zip(TAG_FIELDS, starts, strict=False)  # the last start is the end
     return PROTOCOL.substitute(
         {name: _enum_table(kind) for name, kind in kinds.items()},
         note=_NOTE,
@@ -82,15 +85,8 @@ def protocol_markdown() -> str:
         map_end=f"0x{registers.MAP_END:04x}",
         code_memory=f"0x{registers.CODE_MEMORY:04x}",
         time_bits=registers.TIME_BITS,
-        tag_fields="".join(_tag_rows()),
+        tag_fields="".join(f"| {name} | {bits} | {at} |\n" for (name, bits), at in fields),
     )
-
-
-def _tag_rows() -> Iterator[str]:
-    at = 0
-    for name, bits in TAG_FIELDS:
-        yield f"| {name} | {bits} | {at} |\n"
-        at += bits // 8
 
 
 def _rows(register: Register) -> Iterator[str]:
@@ -110,6 +106,7 @@ def _rows(register: Register) -> Iterator[str]:
 
 
 def _enum_table(kind: type[IntEnum | IntFlag]) -> str:
+    # From the source, since Python does not keep the texts below the members of an enumeration.
     found = re.findall(r"^    (\w+) = .*\n    \"\"\"(.*?)\"\"\"", inspect.getsource(kind), re.MULTILINE)
     docs = dict(found)
     form = "0x{:02x}" if kind is FrameType else "{}"  # types in hexadecimal, since their bits have a meaning

@@ -40,6 +40,7 @@ class LoadedCode:
 
     def bits(self, start: int, length: int) -> NDArray[np.uint8]:
         index = np.arange(start, start + length)
+        # A run has no code before its first line; a negative index would find the end of the loaded one.
         return np.where(index < 0, 0, self.loaded[index % len(self.loaded)]).astype(np.uint8)
 
     def to_attrs(self) -> dict[str, Any]:
@@ -120,9 +121,8 @@ def register_values(
         config = with_delays(config, run.delays)
     if run.window is not None:
         config = with_window(config, run.window)
-    _check_timing(run, config, device)
     distance = run.substep_ticks if config.line_start == "per-substep" else run.line_period_ticks
-    _check_pulses(config, distance)
+    _check_timing(run, config, device, distance)
     _check_tags(run, device, bytes_per_s)
     _check_watchdog(config)
     return {
@@ -164,7 +164,7 @@ def with_window(config: TriggerConfig, window: LightWindow) -> TriggerConfig:
     return config.model_copy(update={"light": config.light.model_copy(update=light)})
 
 
-def _check_timing(run: TriggerRun, config: TriggerConfig, device: Capabilities) -> None:
+def _check_timing(run: TriggerRun, config: TriggerConfig, device: Capabilities, distance: int) -> None:
     if config.clock_hz != device.clock_hz:
         raise TriggerError(
             f"trigger.clock_hz is {config.clock_hz} Hz, which is not the clock of this device",
@@ -189,9 +189,6 @@ def _check_timing(run: TriggerRun, config: TriggerConfig, device: Capabilities) 
             possible="start by command",
             hint="trigger.external_start='off'",
         )
-
-
-def _check_pulses(config: TriggerConfig, distance: int) -> None:
     if distance < config.camera_min_period_ticks:
         raise TriggerError(
             f"the camera pulses are only {distance} ticks apart",
@@ -236,8 +233,9 @@ def _code(attrs: Mapping[str, Any], device: Capabilities) -> dict[r.Register, in
         source = r.CODE_SOURCE.pack(kind=r.Source.MEMORY)
         return values | {r.CODE_SOURCE: source, r.CODE_LENGTH: int(attrs["length"])}
     if kind == "prbs" and tuple(attrs["taps"]) == TAPS.get(int(attrs["degree"])):
+        # Not the attribute `seed`, which is the user's number: the state of the register was made from it.
         mask, state = sum(1 << tap - 1 for tap in attrs["taps"]), register_state(attrs)
-        if 0 < state < 1 << attrs["degree"]:
+        if 0 < state < 1 << attrs["degree"]:  # a register of zeros would stay 0 for ever
             source = r.CODE_SOURCE.pack(kind=r.Source.PRBS)
             return values | {r.CODE_SOURCE: source, r.PRBS_MASK: mask, r.PRBS_SEED: state}
     raise TriggerError(

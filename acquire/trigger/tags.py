@@ -68,37 +68,35 @@ class TagReader:
 
     def take(self, arrivals: Iterable[TagArrival]) -> list[LineTag]:
         """Return the tags of lines, without those of events and of other runs."""
-        return [tag for arrival in arrivals if (tag := self._take(arrival))]
-
-    def _take(self, arrival: TagArrival) -> LineTag | None:
-        number, tag = arrival
-        if tag.run != self._number:  # of the previous run: it was still on its way in link or queue
-            return None
-        # Two counters of the device that must agree: a check of the gateware, in addition to the frame's CRC.
-        wrong = tag.code_index != tag.line * self._run.substeps
-        # 16-bit numbers wrap: one that seems more than half a turn ahead is behind, unless its line is newer,
-        # which means that as many were lost.
-        ahead = (number - self._next) % _NUMBERS
-        if ahead >= _NUMBERS // 2 and (wrong or tag.line <= self._newest_line):
-            self._counts["tags_repeated"] += 1
-            return None
-        self._next = (number + 1) % _NUMBERS
-        self._counts["tags_missing"] += ahead
-        if wrong:
-            self._counts["tags_wrong"] += 1
-            return None
-        self._counts["tags"] += 1
-        self._newest_line = max(self._newest_line, tag.line)
-        if not tag.flags & TagFlag.NO_LINES:
-            self.lines_known = max(self.lines_known, tag.line + 1)
-        for flag, kind in EVENTS.items():
-            if tag.flags & flag:
-                self._events.append(
-                    TagEvent(tag.line, self._ticks_since_start(tag.timestamp, tag.line), kind)
-                )
-        if not tag.flags & TagFlag.LINE:
-            return None
-        return LineTag(tag.line, tag.code_index, self._ticks_since_start(tag.timestamp, tag.line))
+        found = []
+        for number, tag in arrivals:
+            if tag.run != self._number:  # of the previous run: it was still on its way in link or queue
+                continue
+            # Two counters of the device that must agree: a check of the gateware, besides the frame's CRC.
+            wrong = tag.code_index != tag.line * self._run.substeps
+            # 16-bit numbers wrap: one that seems more than half a turn ahead is behind, unless its line is
+            # newer, which means that as many were lost.
+            ahead = (number - self._next) % _NUMBERS
+            if ahead >= _NUMBERS // 2 and (wrong or tag.line <= self._newest_line):
+                self._counts["tags_repeated"] += 1
+                continue
+            # Also for a wrong one, which has used up its number: it would count as missing as well.
+            self._next = (number + 1) % _NUMBERS
+            self._counts["tags_missing"] += ahead
+            if wrong:
+                self._counts["tags_wrong"] += 1
+                continue
+            self._counts["tags"] += 1
+            self._newest_line = max(self._newest_line, tag.line)
+            if not tag.flags & TagFlag.NO_LINES:
+                self.lines_known = max(self.lines_known, tag.line + 1)
+            ticks = self._ticks_since_start(tag.timestamp, tag.line)
+            self._events += [
+                TagEvent(tag.line, ticks, kind) for flag, kind in EVENTS.items() if tag.flags & flag
+            ]
+            if tag.flags & TagFlag.LINE:
+                found.append(LineTag(tag.line, tag.code_index, ticks))
+        return found
 
     def _ticks_since_start(self, timestamp: int, line: int) -> int:
         """Return the ticks since the start, those nearest to the line's, since 48 bits wrap after weeks."""

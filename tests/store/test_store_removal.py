@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import re
 from pathlib import Path
@@ -13,6 +14,7 @@ from store_helpers import Truth, check_rows, fill, make_spec
 
 import acquire
 from acquire.errors import AcquireError, DataError
+from acquire.lines import ARMS
 from acquire.store import RecordingWriter, Retention, RunCondition, hold, open_recording, recover, verify
 from acquire.store.files import DISK
 from acquire.store.rebuild import DAMAGED_ROOT
@@ -104,6 +106,19 @@ def test_the_root_of_a_sealed_recording_is_rebuilt_as_it_was(path):
     (path / "zarr.json").unlink()
     assert recover(path).root_rebuilt
     assert (path / "zarr.json").read_bytes() == before
+
+
+@pytest.mark.parametrize("rows", [0, 1e999])
+def test_a_root_is_not_rebuilt_from_arrays_that_cannot_be(path, rows):
+    leave_open(path)
+    (path / "zarr.json").unlink()
+    for arm in ARMS:
+        file = path / arm / "lines" / "zarr.json"
+        document = json.loads(file.read_bytes())
+        document["codecs"][0]["configuration"]["chunk_shape"][0] = rows
+        file.write_text(json.dumps(document).replace("Infinity", "1e999"))
+    with pytest.raises(DataError, match=r"its root zarr\.json is lost, and its arrays are damaged"):
+        recover(path)
 
 
 @pytest.mark.parametrize("lost", ["a/zarr.json", "b/lines/zarr.json", "a/tick/zarr.json", "events/zarr.json"])

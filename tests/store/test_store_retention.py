@@ -224,12 +224,17 @@ def test_holds_that_cannot_be_are_refused(path):
         hold(path, 1000, 5)
 
 
-def test_a_file_that_is_no_hold_holds_everything_and_is_named(path):
+@pytest.mark.parametrize(
+    "text",
+    ["{", '{"first_line": 1e999, "count": 5, "why": ""}', '{"first_line": -5, "count": 5, "why": ""}'],
+    ids=["torn", "infinite", "negative"],
+)
+def test_a_file_that_is_no_hold_holds_everything_and_is_named(path, text):
     """It may have meant any line; the recording goes on until the disk is full, and says why."""
     with RecordingWriter.create(path, spec_of(AGE)) as writer:
         grow(writer, 6 * SHARD)
         hold(path, 1500, 5)
-        (path / "a" / "lines" / ".holds" / "1-2.json").write_text("{")
+        (path / "a" / "lines" / ".holds" / "1-2.json").write_text(text)
         grow(writer, 6 * SHARD)
         assert left(path) == list(range(4, 12))
         (why,) = [why for _, _, why in open_recording(path).attrs["holds"] if "no hold" in why]

@@ -135,6 +135,26 @@ def test_after_a_longer_pause_the_recording_goes_on_in_a_further_segment(tmp_pat
         check_books(capture, *(part.path for part in parts))
 
 
+def test_a_recording_that_is_extended_while_its_next_segment_is_created_ends_that_late(
+    tmp_path: Path,
+) -> None:
+    """As by an event: a recorder that is creating a segment takes no such command, and gets it once more."""
+    lines = 30_000
+    disk = PausingDisk(tmp_path / "gate", "make")
+    with recording(tmp_path / "r.zarr", disk, lines) as capture:
+        end_line = (capture.poll().first_line or 0) + lines + 4000
+        recorder = capture.pids["recorder"]
+        assert recorder is not None
+        disk.gate.touch()
+        os.kill(recorder, signal.SIGKILL)
+        until(disk.held.exists, "the successor's segment")
+        capture.extend(end_line)
+        disk.gate.unlink()
+        assert until_done(capture).end_reason == "line budget reached"
+        segment = check_whole(tmp_path / "r-2.zarr")
+        assert segment.first_line + segment.lines == end_line
+
+
 def test_a_recording_whose_end_passes_during_the_pause_has_ended(tmp_path: Path) -> None:
     """No further segment can begin: it says so, and does not wait for one."""
     path, lines = tmp_path / "r.zarr", (SHORT_RING + 100) * 64

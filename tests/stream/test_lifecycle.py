@@ -14,7 +14,7 @@ import acquire
 from acquire.errors import StateError, StoreError
 from acquire.store import RunCondition
 from acquire.stream.lifecycle import MEANINGS, TABLE, UNDER_WAY, Event, Lifecycle, Stage
-from acquire.stream.messages import Began, Begin, Refused, Sealed
+from acquire.stream.messages import Began, Begin, End, Extend, Refused, Sealed
 
 ARROWS = """
 none start asked
@@ -196,7 +196,7 @@ def test_a_stop_during_a_pause_cancels_the_further_segment(tmp_path: Path) -> No
     assert bench.happen(Event.END) is True
     assert bench.life.sealed is CUT_SHORT
     assert bench.life.due(1e9) is None
-    assert bench.happen(Event.BEGAN) == "stopped", "one that has begun all the same ends at once"
+    assert bench.happen(Event.BEGAN) == End("stopped"), "one that has begun all the same ends at once"
 
 
 @pytest.mark.parametrize("then", [Event.REFUSED, Event.KILLED])
@@ -233,6 +233,16 @@ def test_a_budget_stays_through_segments_and_can_be_prolonged_between_them(tmp_p
     successor = one.happen(Event.KILLED)
     assert isinstance(successor, Begin)
     assert (successor.window.at, successor.window.post_lines) == (500 + 850, 5000 - 850)
+
+
+@pytest.mark.parametrize("stage", [Stage.REPLACED, Stage.PAUSED])
+def test_a_segment_that_was_being_created_is_extended_once_it_has_begun(tmp_path: Path, stage: Stage) -> None:
+    bench = Bench(tmp_path, stage, LINES)
+    bench.life.due(10.0)
+    bench.life.extend(7000)
+    assert bench.happen(Event.BEGAN) == Extend(7000)
+    assert bench.life.began == Began(500, 7000)
+    assert Bench(tmp_path / "as-asked", stage, LINES).happen(Event.BEGAN) is None
 
 
 def test_a_pause_ends_with_the_recording_s_end(tmp_path: Path) -> None:

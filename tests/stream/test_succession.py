@@ -6,8 +6,9 @@ import itertools
 import os
 import signal
 from collections.abc import Iterator
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
+from threading import Event
 
 import numpy as np
 import pytest
@@ -19,12 +20,15 @@ from acquire.errors import DeviceError
 from acquire.lines import ARMS, LineFlag
 from acquire.pattern import Pattern
 from acquire.processes.nursery import nursery
+from acquire.processes.worker import Worker
 from acquire.rig import Rig
 from acquire.store import open_recording
 from acquire.store.recovery import recover
 from acquire.stream import Orphan
 from acquire.stream.lifecycle import Stage
 from acquire.stream.messages import Begin
+from acquire.stream.succession import Succession
+from acquire.stream.supervisor import Supervisor
 
 WAIT_S = 300.0
 RIG = """
@@ -253,3 +257,56 @@ def test_a_recorder_that_is_killed_while_it_begins_refuses_at_once(run, tmp_path
     run.capture.start(Begin(tmp_path / "s.zarr", run.spec(), 1000))
     until(lambda: run.capture.poll().done)
     assert check(tmp_path / "s.zarr") <= {"ring_full"}
+
+
+def test_a_start_that_comes_while_a_recorder_is_replaced_finds_its_successor(run, tmp_path, monkeypatch):
+    """It was sent to the successor, and then refused as one of the dead recorder: the answer was a fault."""
+    end, life = Worker.end, run.capture._supervisor.life
+    with ThreadPoolExecutor(1) as user:
+        started = []
+
+        def start_first(worker, deadline):
+            if not started:
+                begin = Begin(tmp_path / "r.zarr", run.spec(), 1000)
+                started.append(user.submit(run.capture.start, begin))
+                until(lambda: life.stage is Stage.ASKED)
+            end(worker, deadline)
+
+        monkeypatch.setattr(Worker, "end", start_first)
+        kill(run, "recorder")
+        until(lambda: started)
+        started[0].result(WAIT_S)
+    until(lambda: run.capture.poll().done)
+    assert run.capture.poll().fault is None
+    assert run.capture.poll().orphans == ()
+    assert check(tmp_path / "r.zarr") <= {"ring_full"}
+
+
+def test_a_capture_that_is_closed_while_its_recorder_is_replaced_does_not_record_on(
+    run, tmp_path, monkeypatch
+):
+    """The dead recorder got the interruption, and its successor went on until the recording's end."""
+    successor, interrupt, interrupted = Succession.successor, Supervisor.interrupt_recording, Event()
+
+    def close_first(succession, name):
+        if not interrupted.is_set():
+            closed.append(user.submit(run.capture.close))
+            assert interrupted.wait(WAIT_S)
+        return successor(succession, name)
+
+    def tell(supervisor, reason):
+        interrupt(supervisor, reason)
+        interrupted.set()
+
+    run.capture.start(Begin(tmp_path / "r.zarr", run.spec(), 60_000))
+    until(lambda: run.capture.poll().committed_lines > 2000)
+    monkeypatch.setattr(Succession, "successor", close_first)
+    monkeypatch.setattr(Supervisor, "interrupt_recording", tell)
+    with ThreadPoolExecutor(1) as user:
+        closed: list[Future[None]] = []
+        kill(run, "recorder")
+        until(lambda: closed)
+        closed[0].result(WAIT_S)
+    seen = run.capture.poll()
+    assert (seen.condition, seen.end_reason) == ("INTERRUPTED", "the capture was closed")
+    assert check(tmp_path / "r-2.zarr") == set()

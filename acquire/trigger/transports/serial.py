@@ -65,6 +65,7 @@ class SerialTransport:
     def read(self) -> bytes:
         try:
             if self._local:
+                # What is there, or one byte: pyserial waits for all the bytes that it is asked for.
                 return bytes(self._port.read(self._port.in_waiting or 1))
             # A socket does not report how much is waiting; with timeout 0 it returns what it has.
             data = bytes(self._port.read(1))

@@ -16,6 +16,7 @@ from acquire.trigger.transports.lock import PortLock
 VENDOR, PRODUCT = 0x1209, 0x0001
 """The IDs of pid.codes for private testing."""
 _WRITE_S = 2.0
+# A multiple of every packet size: libusb reports an overflow if a packet exceeds the rest of the buffer.
 _READ_BYTES = 16384
 _IN = usb.util.ENDPOINT_IN
 _BULK = usb.util.ENDPOINT_TYPE_BULK
@@ -45,7 +46,7 @@ def list_devices(backend: Any = None) -> list[FoundDevice]:
 
 
 def _look(device: Any) -> FoundDevice:
-    # Reading a serial number requires permission to open the device.
+    # Reading a serial number opens the device, which requires permission, and is undone below.
     name = f"usb {VENDOR:04x}:{PRODUCT:04x}"
     try:
         serial = str(device.serial_number or "")
