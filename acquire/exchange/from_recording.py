@@ -12,6 +12,7 @@ from acquire.errors import UsageError
 from acquire.exchange.content import Array, Axis, Block, Content, block, little
 from acquire.flags import ARMS, NO_IMAGE, LineFlag
 from acquire.store.present import MISSING, flags_of, present_values
+from acquire.text import visible
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -55,7 +56,7 @@ def recording_content(recording: Recording, rows: range | None = None) -> Conten
     )
     return Content(
         kind="lines",
-        title=str(recording),
+        title=visible(recording),
         axes=(Axis("arm"), Axis("line", float(rows.step), first_line), Axis("pixel", 1.0)),
         image=image,
         columns=tuple(_columns(recording, rows)),

@@ -26,7 +26,7 @@ from acquire.exchange import (
     video_content,
 )
 from acquire.lines import LineFlag
-from acquire.store import open_recording, open_video
+from acquire.store import open_recording, open_video, write_video
 
 FIRST, M, S, TRUSTED = 100, 6, 2, range(3, 17)
 Cli = Callable[..., tuple[int, str, str]]
@@ -154,6 +154,35 @@ def test_frames_that_are_not_trusted_are_left_out_or_named(cli: Cli, video: Path
         assert json.loads(str(saved["facts"]))["frames"] == [3, 8]
 
 
+SUFFIXES = (".tif", ".ome.tif", ".h5", ".npz", ".mp4")
+
+
+@pytest.mark.parametrize("suffix", SUFFIXES)
+@pytest.mark.parametrize(("frames", "trusted"), [(range(3), [3, 3]), (range(18, 20), [0, 0])])
+def test_frames_of_which_none_is_trusted_are_written(
+    video: Path, tmp_path: Path, frames: range, trusted: list[int], suffix: str
+) -> None:
+    content = video_content(open_video(video), "v", frames, whole=True)
+    assert (content.facts["trusted_frames"], content.untrusted) == (trusted, len(frames))
+    assert export(content, tmp_path / f"v{suffix}") > 0
+
+
+@pytest.mark.parametrize("suffix", SUFFIXES)
+def test_odd_names_and_units_are_escaped_where_a_format_cannot_hold_them(tmp_path: Path, suffix: str) -> None:
+    frames, time_ns = np.ones((3, 7, 5), np.float32), np.arange(3, dtype=np.int64)
+    write_video(tmp_path / "video.zarr", frames, time_ns, 2.5, 1, {}, pixel_unit="µm")
+    out = tmp_path / f"Gerät 1{suffix}"
+    assert export(video_content(open_video(tmp_path / "video.zarr"), "caf\udce9 \x01é"), out) > 0
+    if suffix == ".tif":
+        with tifffile.TiffFile(out) as file:
+            assert file.imagej_metadata is not None
+            assert file.imagej_metadata["unit"] == r"\u00B5m"
+    elif suffix == ".ome.tif":
+        with tifffile.TiffFile(out) as file:
+            image = tifffile.xml2dict(file.ome_metadata)["OME"]["Image"]
+        assert (image["Name"], image["Pixels"]["PhysicalSizeXUnit"]) == (r"caf\udce9 \x01é", "µm")
+
+
 def test_times_choose_frames(cli: Cli, video: Path, tmp_path: Path) -> None:
     utc = "2023-11-14T22:13:20.000120"  # 12 frames after the first
     assert cli("export", video, tmp_path / "v.npz", "--from", "50us", "--to", utc)[0] == 0
@@ -276,13 +305,22 @@ def test_times_choose_lines(cli: Cli, recording: Path, tmp_path: Path) -> None:
         (["video", "v.mp4", "--peak", -1], "above 0"),
         (["nothing", "v.npy"], "does not exist"),
         (["video", "no/v.npy"], "does not exist"),
+        (["video", "."], "cannot be taken from its name"),
+        (["video", ".."], "cannot be taken from its name"),
     ],
 )
 def test_impossible_requests_are_refused_and_nothing_is_changed(
-    cli: Cli, recording: Path, video: Path, tmp_path: Path, words: list[Any], said: str
+    cli: Cli,
+    recording: Path,
+    video: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    words: list[Any],
+    said: str,
 ) -> None:
     source = {"run": recording, "video": video}.get(words[0], tmp_path / "absent.zarr")
-    code, _, err = cli("export", source, tmp_path / words[1], *words[2:])
+    monkeypatch.chdir(tmp_path)
+    code, _, err = cli("export", source, words[1], *words[2:])
     assert (code, said in err) == (2, True), err
     assert not list(tmp_path.iterdir())
 
