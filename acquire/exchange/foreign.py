@@ -25,6 +25,7 @@ from acquire.exchange.libraries import library
 from acquire.reading import kind_of
 from acquire.store.layout import DAMAGE
 from acquire.store.refusals import refused
+from acquire.text import shortened
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -292,7 +293,17 @@ def _tiff(path: Path, _: Layout, held: ExitStack) -> LineFile:
     """Open a TIFF file: its pages are consecutive ranges of lines, and two channels are the arms."""
     tifffile = library("tifffile", "export", "a TIFF file")
     file = held.enter_context(tifffile.TiffFile(path))
-    series = file.series[0]
+    series, *others = file.series
+    # Blocks that a program wrote one by one are several images to the library; thumbnails are no lines.
+    alike = [each for each in others if (each.shape[-1], each.dtype) == (series.shape[-1], series.dtype)]
+    if alike:
+        shapes = ", ".join(" x ".join(map(str, each.shape)) for each in (series, *alike))
+        raise UsageError(
+            f"{path} holds {1 + len(alike)} images of lines, of which only the first would be read: "
+            f"{shortened(shapes)}",
+            possible="one image, whose pages have the same size",
+            hint="the lines as one array, in a .npy file or a TIFF file of one image",
+        )
     # tifffile states the type in native byte order, and the pixels are read as they are in the file.
     shape, dtype = tuple(map(int, series.shape)), np.dtype(file.byteorder + series.dtype.str[1:])
     arms = len(shape) == 3 and series.axes.startswith("C") and shape[0] == 2

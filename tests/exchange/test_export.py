@@ -207,6 +207,17 @@ def test_a_movie_shows_what_the_video_holds(
     assert (facts["white"], facts["frames"], facts["enlarged"]) == (1.0, [3, 17], times)
 
 
+@pytest.mark.parametrize("column", [0, 5, 17])
+def test_white_is_found_wherever_it_is(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, column: int) -> None:
+    frames, time_ns = np.full((2, 64, 32), 0.01, np.float32), np.arange(2, dtype=np.int64)
+    frames[:, :, column] = 1
+    write_video(tmp_path / "video.zarr", frames, time_ns, 2.5, 1, {})
+    monkeypatch.setattr(movie, "SAMPLED", 2 * 64 * 2)  # every 16th voxel: of two columns of 32
+    export(video_content(open_video(tmp_path / "video.zarr"), "v"), tmp_path / "v.mp4")
+    with av.open(str(tmp_path / "v.mp4")) as file:
+        assert json.loads(file.metadata["comment"])["white"] == 1.0
+
+
 @pytest.mark.parametrize("block_bytes", [200, 2**23])
 def test_lines_and_tags_of_a_recording(
     recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, block_bytes: int
