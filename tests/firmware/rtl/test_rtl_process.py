@@ -140,6 +140,34 @@ def test_without_a_compiler_the_rig_says_what_to_install(
         RtlTransport(CLOCK_HZ)
 
 
+def test_a_cache_that_cannot_be_written_is_named(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    (tmp_path / "cache").touch()
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    with pytest.raises(TriggerError, match=r"cache/acquire/rtl cannot be written: .*XDG_CACHE_HOME"):
+        RtlTransport(CLOCK_HZ)
+
+
+def test_a_process_that_dies_at_its_start_is_not_said_to_be_slow(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    (tmp_path / "firmware").mkdir()
+    (tmp_path / "firmware" / "__init__.py").touch()
+    (tmp_path / "firmware" / "twin.py").write_text("raise SystemExit(3)")
+    monkeypatch.setattr(acquire.sim.rtl, "ROOT", tmp_path)
+    monkeypatch.delenv("PYTHONPATH", raising=False)
+    with pytest.raises(TriggerError, match="ended before it could report anything"):
+        RtlTransport(CLOCK_HZ)
+
+
+def test_a_folder_of_the_same_name_where_one_works_does_no_harm(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    (tmp_path / "firmware").mkdir()
+    (tmp_path / "firmware" / "__init__.py").write_text("raise SystemExit('of another project')")
+    monkeypatch.chdir(tmp_path)
+    RtlTransport(CLOCK_HZ).close()
+
+
 def test_the_demo_records_from_the_gateware(tmp_path: Path) -> None:
     """Every pixel follows Eq. (1) with the requested code; the light came from the LED's pin."""
     out = tmp_path / "out"
