@@ -144,7 +144,7 @@ def test_a_stop_of_an_armed_run_is_owed_however_often_it_fails(cable, driver) ->
     driver.prepare(run())
     cable.unplug()
     for _ in range(3):
-        with pytest.raises(TriggerError, match="is not there|is gone"):
+        with pytest.raises(TriggerError, match=r"is not there|is gone"):
             driver.stop()
     cable.plug()
     driver.prepare(run("next"))
