@@ -18,7 +18,7 @@ from acquire.camera.base import CameraLoss, LossCause
 from acquire.camera.harvesters import HarvestersCamera, list_cameras
 from acquire.camera.settings import Setting
 from acquire.camera.spec import GenicamSpec
-from acquire.errors import CameraError, CameraLostError, PlaceError
+from acquire.errors import CameraError, CameraLostError, PlaceError, UsageError
 from acquire.lines import LineFlag
 from acquire.sim.gentl.bench import GentlBench
 from acquire.sim.gentl.build import build
@@ -273,6 +273,12 @@ def test_a_thousand_starts_are_as_good_as_one(open_camera: Any) -> None:
     after = process.memory_info().rss, process.num_fds(), process.num_threads()
     assert after[1:] == before[1:]
     assert after[0] - before[0] < 4 << 20
+
+
+@pytest.mark.parametrize("serial", ["", "a/b", "nul\0", "x" * 64, "é" * 32])
+def test_a_serial_that_cannot_name_a_file_is_refused(serial: str) -> None:
+    with pytest.raises(UsageError, match="possible: 1 to 63 bytes without a slash"):
+        GentlBench({CameraModel(serial, WIDTH): RampOpener(RATE_HZ)})
 
 
 LOOK = """
