@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 from waiting import until
 
 import acquire.sim.rtl
@@ -89,6 +90,23 @@ def test_reading_light_that_was_discarded_is_an_error(page: PinPage) -> None:
         page.publish(PinRun(2, True, (1, 1), 60), bytes(1 << 20), CLOCK_HZ)
     with pytest.raises(DeviceError, match="too late"):
         page.light(2, 0, 5)
+
+
+def test_light_that_the_next_run_overwrites_while_it_is_read_is_an_error(
+    page: PinPage, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    awaited = page._await_light
+
+    def then_overwritten(run: int, end: int) -> NDArray[np.uint64]:
+        fields = awaited(run, end)
+        page.publish(PinRun(2, True, (1, 1), 60), bytes(50), CLOCK_HZ)
+        return fields
+
+    page.publish(PinRun(1, False, (5, 5), 60), bytes([1]) * 100, CLOCK_HZ)
+    assert page.light(1, 0, 100).all()
+    monkeypatch.setattr(page, "_await_light", then_overwritten)
+    with pytest.raises(DeviceError, match="run 1 of the trigger is over"):
+        page.light(1, 0, 100)
 
 
 def test_it_ends_when_its_owner_is_killed() -> None:
