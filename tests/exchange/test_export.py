@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import json
+import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -370,3 +371,20 @@ def test_a_full_disk_leaves_nothing(video: Path, tmp_path: Path, monkeypatch: py
     with pytest.raises(Exception, match="No space left"):
         export(video_content(open_video(video), "v"), tmp_path / "v.npy")
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("most_bytes", [0, 3000, 20_000])
+@pytest.mark.parametrize("suffix", SUFFIXES)
+def test_a_disk_that_takes_no_more_is_an_error_and_not_the_end_of_the_process(
+    tmp_path: Path, suffix: str, most_bytes: int
+) -> None:
+    """HDF5 itself crashes when it closes a file that it cannot write."""
+    frames = np.random.default_rng(8).random((8, 64, 64)).astype(np.float32)
+    write_video(tmp_path / "v.zarr", frames, np.arange(8, dtype=np.int64), 2.5, 1, {})
+    limited = f"import resource; resource.setrlimit(resource.RLIMIT_FSIZE, ({most_bytes}, -1));"
+    program = [sys.executable, "-c", f"{limited} from acquire.cli import main; raise SystemExit(main())"]
+    words = ["export", str(tmp_path / "v.zarr"), str(tmp_path / f"v{suffix}")]
+    done = subprocess.run([*program, *words], capture_output=True, text=True, check=False)
+    assert (done.returncode, "File too large" in done.stderr) == (5, True), done.stderr
+    assert "Traceback" not in done.stderr
+    assert [path.name for path in tmp_path.iterdir()] == ["v.zarr"]
