@@ -28,6 +28,7 @@ from acquire.exchange import (
 )
 from acquire.lines import LineFlag
 from acquire.store import open_recording, open_video, write_video
+from acquire.store.present import flags_of
 
 FIRST, M, S, TRUSTED = 100, 6, 2, range(3, 17)
 Cli = Callable[..., tuple[int, str, str]]
@@ -280,6 +281,30 @@ def test_an_overview_is_the_mean_of_the_lines_that_are_there(
         missing = (saved["flags"] & LineFlag.MISSING) != 0
         assert (code, [np.flatnonzero(arm).tolist() for arm in missing]) == (0, [[], [0]]), err
         assert not saved["lines"][1, 0].any()
+
+
+@pytest.mark.parametrize("step", [40, 90, 1000])
+def test_an_overview_does_not_read_a_long_group_of_lines_at_once(
+    recording: Path, monkeypatch: pytest.MonkeyPatch, step: int
+) -> None:
+    opened, most, read = open_recording(recording), 7, []
+    content = recording_content(opened, range(2, 90, step))
+
+    def exported() -> list[Any]:
+        arrays = (content.image, *content.columns)
+        return [np.concatenate([values for _, values in array.blocks()]) for array in arrays]
+
+    at_once = exported()
+
+    def observed(opened: Any, arm: str, start: int, stop: int) -> Any:
+        read.append(stop - start)
+        return flags_of(opened, arm, start, stop)
+
+    monkeypatch.setattr(from_recording, "BLOCK_BYTES", most * 2 * M)
+    monkeypatch.setattr(from_recording, "flags_of", observed)
+    for in_parts, whole in zip(exported(), at_once, strict=True):
+        np.testing.assert_array_equal(in_parts, whole)
+    assert max(read) <= most
 
 
 def test_damaged_lines_are_left_out_of_averages() -> None:
