@@ -215,10 +215,29 @@ def _plain(
     return read
 
 
+def _by_pixel(
+    path: Path, dtype: np.dtype[Any], shape: tuple[int, ...], offset: int
+) -> Callable[[int | None, int, int], NDArray[Any]]:
+    """Return a reader as `_plain` does, for an array in Fortran order, whose first axis varies fastest."""
+    *arms, lines, pixels = shape
+    step = math.prod(arms)
+
+    def read(arm: int | None, start: int, stop: int) -> NDArray[Any]:
+        begins = (offset + (pixel * lines + start) * step * dtype.itemsize for pixel in range(pixels))
+        count = (stop - start) * step
+        columns = [np.fromfile(path, dtype, count, offset=begin)[arm or 0 :: step] for begin in begins]
+        # Only the lines of which a file that was cut short has every pixel.
+        whole = min(map(len, columns))
+        return np.stack([column[:whole] for column in columns], axis=1)
+
+    return read
+
+
 def _numpy(path: Path, _: Layout, __: ExitStack) -> LineFile:
     array = mapped(path)
-    in_order = array.flags.c_contiguous  # in Fortran order a line's pixels are scattered over the file
-    read = _plain(path, array.dtype, array.shape, array.offset) if in_order else _sliced(array)
+    # In Fortran order a line's pixels are scattered over the file.
+    reader = _plain if array.flags.c_contiguous else _by_pixel
+    read = reader(path, array.dtype, array.shape, array.offset) if array.ndim in {2, 3} else _sliced(array)
     return LineFile(path, "NumPy", array.shape, array.dtype, read)
 
 
