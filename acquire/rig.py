@@ -116,7 +116,9 @@ def _check_simulated_cameras(trigger: TriggerConfig, *, simulated: bool) -> None
 
     They only receive the line starts and the code of the light, and a simulated trigger has no inputs.
     """
-    pulsed = trigger.driver != "simulated" and trigger.lit_part != (0.0, 1.0)
+    # Of the gateware's pins, cameras see for each sub-step whether it was lit for most of it.
+    on_pins = trigger.driver != "simulated"
+    pulsed, leads = trigger.lit_part != (0.0, 1.0), trigger.light.lead_ticks != 0
     for ignored, key, possible in (
         (not simulated, f"driver = {trigger.driver!r}", "'simulated'"),
         (trigger.external_start != "off", f"external_start = {trigger.external_start!r}", "'off'"),
@@ -125,7 +127,8 @@ def _check_simulated_cameras(trigger: TriggerConfig, *, simulated: bool) -> None
         (not trigger.b.enable, "b.enable = false", "true"),
         (trigger.a.direction != "forward", f"a.direction = {trigger.a.direction!r}", "'forward'"),
         (trigger.b.direction != "forward", f"b.direction = {trigger.b.direction!r}", "'forward'"),
-        (pulsed, "light.open_ticks, light.close_ticks", "absent, or driver = 'simulated'"),
+        (on_pins and pulsed, "light.open_ticks, light.close_ticks", "absent, or driver = 'simulated'"),
+        (on_pins and leads, f"light.lead_ticks = {trigger.light.lead_ticks}", "0, or driver = 'simulated'"),
     ):
         if ignored:
             raise ConfigError(f"trigger.{key} cannot be simulated", possible=possible)

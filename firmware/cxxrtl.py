@@ -25,8 +25,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from acquire.errors import UsageError
+from acquire.sim.gentl.build import CACHE_HINT
 from acquire.sim.rtl import COMPILER
 from acquire.sim.rtl import missing_tools as missing
+from acquire.store.refusals import refused
 from acquire.trigger import registers as r
 from firmware.toolchain import ToolError, run_tool
 
@@ -201,20 +203,28 @@ def cache_directory() -> Path:
 
 
 def library(build: Build) -> Path:
-    """Return the compiled gateware of ``build``, compiling it unless it is cached."""
+    """Return the compiled gateware of ``build``, compiling it unless it is cached.
+
+    Raises UsageError, and PlaceError or StoreError if the cache directory cannot be written.
+    """
     if reason := missing():
         raise UsageError(f"the gateware cannot be compiled: there is no {reason}")
     build = _alike(build)
     path = cache_directory() / f"{_fingerprint(build)}.so"
     if not path.exists():
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with path.with_suffix(".lock").open("w") as lock:
-            fcntl.flock(lock, fcntl.LOCK_EX)  # if several processes need it, one compiles it
-            if not path.exists():
-                with tempfile.TemporaryDirectory(dir=path.parent) as scratch:
-                    _compile(_translate(build, Path(scratch)), Path(scratch) / path.name)
-                    (Path(scratch) / path.name).rename(path)  # never visible half written
+        with refused(path.parent, "written", hint=CACHE_HINT):
+            _compile_once(build, path)
     return path
+
+
+def _compile_once(build: Build, path: Path) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with path.with_suffix(".lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)  # if several processes need it, one compiles it
+        if not path.exists():
+            with tempfile.TemporaryDirectory(dir=path.parent) as scratch:
+                _compile(_translate(build, Path(scratch)), Path(scratch) / path.name)
+                (Path(scratch) / path.name).rename(path)  # never visible half written
 
 
 @cache

@@ -14,6 +14,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import logging
+import re
 import time
 from typing import TYPE_CHECKING, Any
 
@@ -275,7 +276,8 @@ class Recorder(Device, Stageable, Preparable, Flyable, Collectable, WritesStream
                 try:
                     await asyncio.to_thread(_add_segment, account, now.path)
                 except (PlaceError, DataError):
-                    return True  # a segment that has only just begun cannot be read yet
+                    if _may_continue(account, now.path):
+                        return True  # a segment that has only just begun cannot be read yet
             if now is not None and now.path == account.now.path:
                 first_line = account.now.first_line
                 # The daemon may report the path of a new segment with the counts of the previous one: counts
@@ -320,6 +322,13 @@ class Recorder(Device, Stageable, Preparable, Flyable, Collectable, WritesStream
             )
         if condition != RunCondition.GOOD:
             log.warning("%s: %s is %s: %s", self.name, path, condition, reason)
+
+
+def _may_continue(account: Account, path: Path) -> bool:
+    """Return whether a recording's name is that of a segment of the current one, see `next_segment`."""
+    first = account.segments[0].path
+    pattern = rf"{re.escape(first.stem)}-\d+{re.escape(first.suffix)}"
+    return path.parent == first.parent and re.fullmatch(pattern, path.name) is not None
 
 
 def _add_segment(account: Account, path: Path) -> None:

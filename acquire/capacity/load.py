@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import os
+import shutil
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
@@ -96,6 +99,14 @@ def _code() -> PrbsCode:
 def trigger_run(load: Load) -> TriggerRun:
     """Return the trigger's run for a load."""
     return TriggerRun("load", _code(), load.substeps, load.substep_ticks, tag_every_lines(load))
+
+
+def scratch_path(directory: Path, kind: str) -> Path:
+    """Return a path for this process's recording, and remove those of processes that were killed."""
+    for leftover in directory.glob(f".{kind}-*.zarr"):
+        if not Path("/proc", leftover.stem.removeprefix(f".{kind}-")).exists():
+            shutil.rmtree(leftover, ignore_errors=True)
+    return directory / f".{kind}-{os.getpid()}.zarr"
 
 
 def recording_spec(load: Load, clock: ClockFit) -> RecordingSpec:

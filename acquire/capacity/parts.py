@@ -10,12 +10,11 @@ import os
 import shutil
 import time
 from dataclasses import dataclass
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from acquire.capacity.load import recording_spec, trigger_run
+from acquire.capacity.load import recording_spec, scratch_path, trigger_run
 from acquire.clock import ClockFit
 from acquire.lines import ARMS, LineBlock
 from acquire.pattern import Pattern
@@ -26,6 +25,7 @@ from acquire.stream.tagger import Tagger
 
 if TYPE_CHECKING:
     from collections.abc import Callable
+    from pathlib import Path
 
     from numpy.typing import NDArray
 
@@ -35,7 +35,6 @@ PART_S = 0.15
 """Duration of each part's measurement."""
 _BLOCKS = 8
 """Number of different blocks per arm: too many for a processor's cache to hold them all."""
-_PREFIX = ".capacity-"
 _CLOCK = ClockFit(90_000_000, 0, 0)
 
 
@@ -133,11 +132,7 @@ def _pace_of_ring(load: Load, blocks: list[NDArray[Any]]) -> Pace:
 
 
 def _pace_of_recorder(load: Load, blocks: list[NDArray[Any]], directory: Path) -> Pace:
-    # Remove the recordings of processes that were killed while measuring; their names contain the PID.
-    for leftover in directory.glob(f"{_PREFIX}*.zarr"):
-        if not Path("/proc", leftover.stem.removeprefix(_PREFIX)).exists():
-            shutil.rmtree(leftover, ignore_errors=True)
-    path = directory / f"{_PREFIX}{os.getpid()}.zarr"
+    path = scratch_path(directory, "capacity")
     tagger = Tagger(trigger_run(load), load.stages, _CLOCK)
     flags = np.zeros(load.block_lines, np.uint16)
     with RecordingWriter.create(path, recording_spec(load, _CLOCK)) as writer:

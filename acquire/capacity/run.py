@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from acquire.capacity.latency import Latencies, TimedOpener
-from acquire.capacity.load import CLOCK_HZ, recording_spec, tag_every_lines, trigger_run
+from acquire.capacity.load import CLOCK_HZ, recording_spec, scratch_path, tag_every_lines, trigger_run
 from acquire.config import GeometryConfig
 from acquire.config.device import CameraConfig, TriggerConfig
 from acquire.errors import DataError
@@ -83,7 +83,7 @@ class LoadReport:
 
 def run_load(load: Load, directory: Path, seconds: float) -> LoadReport:
     """Record for ``seconds`` below ``directory``; the recording is removed afterwards."""
-    path = directory / f".load-{time.time_ns():x}.zarr"
+    path = scratch_path(directory, "load")
     wire = Wire()
     latencies = {arm: Latencies() for arm in ARMS}
     config = TriggerConfig(tag_every_lines=tag_every_lines(load))

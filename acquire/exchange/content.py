@@ -44,7 +44,7 @@ class Array:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Content:
-    """The content of an export; ``kind`` is ``video`` or ``lines``.
+    """The content of an export; ``kind`` is ``video`` or ``lines``; ``title`` has no unprintable characters.
 
     ``columns`` lie along axes of the image; arrays in ``beside`` share its first axis and have others of
     their own. ``facts`` is JSON: the origin of the data and the trusted part. ``untrusted`` counts the

@@ -43,7 +43,7 @@ def format_for(path: Path) -> str:
     raise UsageError(
         f"the format of {path} cannot be taken from its name",
         possible=".tif (ImageJ), .ome.tif, .h5 or .nxs (NeXus), .npy, .npz, .mp4",
-        hint=f"{path.with_suffix('.h5')}",
+        hint=f"{path.with_suffix('.h5')}" if path.name.strip(".") else "",
     )
 
 

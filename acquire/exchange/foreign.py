@@ -25,6 +25,7 @@ from acquire.exchange.libraries import library
 from acquire.reading import kind_of
 from acquire.store.layout import DAMAGE
 from acquire.store.refusals import refused
+from acquire.text import shortened
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -214,10 +215,29 @@ def _plain(
     return read
 
 
+def _by_pixel(
+    path: Path, dtype: np.dtype[Any], shape: tuple[int, ...], offset: int
+) -> Callable[[int | None, int, int], NDArray[Any]]:
+    """Return a reader as `_plain` does, for an array in Fortran order, whose first axis varies fastest."""
+    *arms, lines, pixels = shape
+    step = math.prod(arms)
+
+    def read(arm: int | None, start: int, stop: int) -> NDArray[Any]:
+        begins = (offset + (pixel * lines + start) * step * dtype.itemsize for pixel in range(pixels))
+        count = (stop - start) * step
+        columns = [np.fromfile(path, dtype, count, offset=begin)[arm or 0 :: step] for begin in begins]
+        # Only the lines of which a file that was cut short has every pixel.
+        whole = min(map(len, columns))
+        return np.stack([column[:whole] for column in columns], axis=1)
+
+    return read
+
+
 def _numpy(path: Path, _: Layout, __: ExitStack) -> LineFile:
     array = mapped(path)
-    in_order = array.flags.c_contiguous  # in Fortran order a line's pixels are scattered over the file
-    read = _plain(path, array.dtype, array.shape, array.offset) if in_order else _sliced(array)
+    # In Fortran order a line's pixels are scattered over the file.
+    reader = _plain if array.flags.c_contiguous else _by_pixel
+    read = reader(path, array.dtype, array.shape, array.offset) if array.ndim in {2, 3} else _sliced(array)
     return LineFile(path, "NumPy", array.shape, array.dtype, read)
 
 
@@ -292,7 +312,17 @@ def _tiff(path: Path, _: Layout, held: ExitStack) -> LineFile:
     """Open a TIFF file: its pages are consecutive ranges of lines, and two channels are the arms."""
     tifffile = library("tifffile", "export", "a TIFF file")
     file = held.enter_context(tifffile.TiffFile(path))
-    series = file.series[0]
+    series, *others = file.series
+    # Blocks that a program wrote one by one are several images to the library; thumbnails are no lines.
+    alike = [each for each in others if (each.shape[-1], each.dtype) == (series.shape[-1], series.dtype)]
+    if alike:
+        shapes = ", ".join(" x ".join(map(str, each.shape)) for each in (series, *alike))
+        raise UsageError(
+            f"{path} holds {1 + len(alike)} images of lines, of which only the first would be read: "
+            f"{shortened(shapes)}",
+            possible="one image, whose pages have the same size",
+            hint="the lines as one array, in a .npy file or a TIFF file of one image",
+        )
     # tifffile states the type in native byte order, and the pixels are read as they are in the file.
     shape, dtype = tuple(map(int, series.shape)), np.dtype(file.byteorder + series.dtype.str[1:])
     arms = len(shape) == 3 and series.axes.startswith("C") and shape[0] == 2

@@ -12,6 +12,7 @@ from acquire.errors import UsageError
 from acquire.exchange.content import Array, Axis, Block, Content, block, little
 from acquire.flags import ARMS, NO_IMAGE, LineFlag
 from acquire.store.present import MISSING, flags_of, present_values
+from acquire.text import visible
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -55,7 +56,7 @@ def recording_content(recording: Recording, rows: range | None = None) -> Conten
     )
     return Content(
         kind="lines",
-        title=str(recording),
+        title=visible(recording),
         axes=(Axis("arm"), Axis("line", float(rows.step), first_line), Axis("pixel", 1.0)),
         image=image,
         columns=tuple(_columns(recording, rows)),
@@ -100,11 +101,16 @@ def _columns(recording: Recording, rows: range) -> Iterator[Array]:
         )
 
 
-def _steps(recording: Recording, rows: range) -> Iterator[tuple[int, int]]:
-    """Yield the parts of the rows that are read at once, as start and stop."""
+def _block_lines(recording: Recording) -> int:
+    """Return the number of lines whose pixels are in memory at a time."""
     stream = recording.arms[ARMS[0]]
+    return max(1, BLOCK_BYTES // (stream.pixels * stream.dtype.itemsize))
+
+
+def _steps(recording: Recording, rows: range) -> Iterator[tuple[int, int]]:
+    """Yield the parts of the rows that make a block of the export, as start and stop."""
     # A multiple of the step, so that no group of lines is split between two blocks.
-    size = max(1, BLOCK_BYTES // (stream.pixels * stream.dtype.itemsize * rows.step)) * rows.step
+    size = max(1, _block_lines(recording) // rows.step) * rows.step
     for start in range(rows.start, rows.stop, size):
         yield start, min(rows.stop, start + size)
 
@@ -112,6 +118,10 @@ def _steps(recording: Recording, rows: range) -> Iterator[tuple[int, int]]:
 def _of_arms(recording: Recording, rows: range, name: str) -> Iterator[Block]:
     for number, arm in enumerate(ARMS):
         for start, stop in _steps(recording, rows):
+            if stop - start > _block_lines(recording):
+                values = _long_group(recording, arm, name, start, stop)
+                yield block((number, _place(rows, start, stop)), values)
+                continue
             flags = flags_of(recording, arm, start, stop)
             values = flags if name == "flags" else present_values(recording, arm, name, start, flags)
             if rows.step > 1:
@@ -119,10 +129,27 @@ def _of_arms(recording: Recording, rows: range, name: str) -> Iterator[Block]:
             yield block((number, _place(rows, start, stop)), values)
 
 
+def _long_group(recording: Recording, arm: str, name: str, start: int, stop: int) -> NDArray[Any]:
+    """Return the flags, or the mean, of one group of lines that is read in parts: it may be very long."""
+    found, total, there = np.zeros(1, np.uint16), np.zeros(1), 0
+    for begin in range(start, stop, _block_lines(recording)):
+        flags = flags_of(recording, arm, begin, min(stop, begin + _block_lines(recording)))
+        found |= np.bitwise_or.reduce(flags)
+        seen = (flags & NO_IMAGE) == 0
+        there += int(seen.sum())
+        if name == "lines":
+            lines = present_values(recording, arm, name, begin, flags)
+            total = total + lines[seen].sum(axis=0, dtype=np.float64)
+    if name == "flags":
+        return found & ~np.uint16(NO_IMAGE) if there else found
+    return (total / max(there, 1))[None].astype(np.float32)
+
+
 def _of_either(recording: Recording, rows: range, name: str) -> Iterator[Block]:
     """Yield the tags of arm a, or those of arm b where the line of arm a is missing."""
     for start, stop in _steps(recording, rows):
-        flags = {arm: flags_of(recording, arm, start, stop) for arm in ARMS}
+        end = stop if stop - start > rows.step else start + 1  # of a single group only the first tag is used
+        flags = {arm: flags_of(recording, arm, start, end) for arm in ARMS}
         first, other = (present_values(recording, arm, name, start, flags[arm]) for arm in ARMS)
         both = np.where((flags[ARMS[0]] & MISSING) != 0, other, first)
         yield block((_place(rows, start, stop),), both[:: rows.step])

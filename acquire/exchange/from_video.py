@@ -13,6 +13,7 @@ from acquire.exchange.content import Array, Axis, Block, Content, block, little
 from acquire.showing import error_in_words
 from acquire.store.layout import DAMAGE
 from acquire.store.video_layout import ERROR_ATTRIBUTES
+from acquire.text import visible
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -61,7 +62,7 @@ def video_content(
     inside = kept if trusted is None else _common(kept, trusted)
     return Content(
         kind="video",
-        title=title,
+        title=visible(title),
         axes=_axes(video, kept),
         image=image,
         columns=tuple(_columns(video, kept)),
@@ -104,7 +105,9 @@ def _facts(video: VideoFile, title: str, kept: range, inside: range | None) -> d
         "source": title,
         "frames": [kept.start, kept.stop],
         "frames_of_source": len(video.time_ns),
-        "trusted_frames": inside and [inside.start - kept.start, inside.stop - kept.start],
+        "trusted_frames": None
+        if inside is None
+        else [edge - kept.start for edge in (inside.start, inside.stop)],
         "first_frame_utc_ns": int(video.time_ns[kept.start]),
         "frame_interval_s": interval_s,
         "pixel_size": pixel,

@@ -11,16 +11,20 @@
 from __future__ import annotations
 
 import json
+import os
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from acquire import __version__
 from acquire.exchange.libraries import library
+from acquire.store.files import write_all
 
 if TYPE_CHECKING:
     from collections.abc import Callable
     from pathlib import Path
+
+    from typing_extensions import Buffer
 
     from acquire.exchange.content import Array, Axis, Content
 
@@ -28,33 +32,95 @@ CHUNK_BYTES = 2**20
 
 
 def write_hdf5(path: Path, content: Content, advance: Callable[[int], object]) -> None:
-    """Write a NeXus file. Raises OSError from HDF5."""
+    """Write a NeXus file. Raises OSError from the disk."""
     h5py = library("h5py", "export", "an HDF5 file")
-    with h5py.File(path, "w") as file:
-        file.attrs.update({"default": "entry", "creator": f"acquire {__version__}"})
-        entry = _group(file, "entry", "NXentry", default="data")
-        entry["title"] = content.title
-        data = _group(entry, "data", "NXdata", signal=content.image.name)
-        data.attrs["axes"] = [axis.name if axis.step else "." for axis in content.axes]
-        for number, axis in enumerate(content.axes):
-            if axis.step:
-                _write_axis(data, axis, content.image.shape[number])
-                data.attrs[f"{axis.name}_indices"] = number
-        names = [axis.name for axis in content.axes]
-        _write(data, content.image, advance)
-        for array in content.columns:
-            _write(data, array, advance)
-            data.attrs[f"{array.name}_indices"] = [names.index(dim) for dim in array.dims]
-        for array in content.beside:
-            group = _group(entry, array.name, "NXdata", signal=array.name)
-            first, *others = array.dims
-            group.attrs["axes"], group.attrs[f"{first}_indices"] = [first, *("." for _ in others)], 0
-            group[first] = data[first]  # the same dataset, linked
-            _write(group, array, advance)
-        process = _group(entry, "process", "NXprocess")
-        process["program"], process["version"] = "acquire", __version__
-        note = _group(process, "note", "NXnote")
-        note["type"], note["data"] = "application/json", json.dumps(content.facts)
+    with path.open("r+b") as opened:
+        disk = _Disk(opened.fileno())
+
+        def advance_if_written(count: int) -> None:
+            disk.check()
+            advance(count)
+
+        with h5py.File(disk, "w") as file:
+            _write_entry(file, content, advance_if_written)
+        disk.check()
+
+
+class _Disk:
+    """The file under HDF5, which crashes the process when it closes a file that cannot be written.
+
+    It keeps the first error for `check`, and from then on takes everything without writing it.
+    """
+
+    def __init__(self, descriptor: int) -> None:
+        self._descriptor = descriptor
+        self._at = 0
+        self._error: OSError | None = None
+
+    def check(self) -> None:
+        """Raise the error of the disk, if there was one."""
+        if self._error is not None:
+            raise self._error
+
+    def seek(self, offset: int, whence: int = os.SEEK_SET) -> int:
+        start = {os.SEEK_SET: 0, os.SEEK_CUR: self._at}
+        self._at = offset + start.get(whence, os.fstat(self._descriptor).st_size)
+        return self._at
+
+    def tell(self) -> int:
+        return self._at
+
+    def read(self, size: int) -> bytes:
+        found = os.pread(self._descriptor, size, self._at)
+        self._at += size
+        return found.ljust(size, b"\0")  # as HDF5's own driver reads behind the end
+
+    def write(self, data: Buffer) -> int:
+        size = memoryview(data).nbytes
+        self._try(lambda: write_all(self._descriptor, [data], self._at))
+        self._at += size
+        return size
+
+    def truncate(self, size: int) -> int:
+        self._try(lambda: os.ftruncate(self._descriptor, size))
+        return size
+
+    def flush(self) -> None:
+        """Do nothing: there is no buffer."""
+
+    def _try(self, change: Callable[[], object]) -> None:
+        if self._error is None:
+            try:
+                change()
+            except OSError as error:
+                self._error = error
+
+
+def _write_entry(file: Any, content: Content, advance: Callable[[int], object]) -> None:
+    file.attrs.update({"default": "entry", "creator": f"acquire {__version__}"})
+    entry = _group(file, "entry", "NXentry", default="data")
+    entry["title"] = content.title
+    data = _group(entry, "data", "NXdata", signal=content.image.name)
+    data.attrs["axes"] = [axis.name if axis.step else "." for axis in content.axes]
+    for number, axis in enumerate(content.axes):
+        if axis.step:
+            _write_axis(data, axis, content.image.shape[number])
+            data.attrs[f"{axis.name}_indices"] = number
+    names = [axis.name for axis in content.axes]
+    _write(data, content.image, advance)
+    for array in content.columns:
+        _write(data, array, advance)
+        data.attrs[f"{array.name}_indices"] = [names.index(dim) for dim in array.dims]
+    for array in content.beside:
+        group = _group(entry, array.name, "NXdata", signal=array.name)
+        first, *others = array.dims
+        group.attrs["axes"], group.attrs[f"{first}_indices"] = [first, *("." for _ in others)], 0
+        group[first] = data[first]  # the same dataset, linked
+        _write(group, array, advance)
+    process = _group(entry, "process", "NXprocess")
+    process["program"], process["version"] = "acquire", __version__
+    note = _group(process, "note", "NXnote")
+    note["type"], note["data"] = "application/json", json.dumps(content.facts)
 
 
 def _group(parent: Any, name: str, kind: str, **attributes: str) -> Any:

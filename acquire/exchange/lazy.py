@@ -45,7 +45,9 @@ class Stack:
 
     def __getitem__(self, index: Any) -> NDArray[Any]:
         """Read the selected pictures. Raises UsageError for more than `MOST_BYTES`."""
-        first, *rest = index if isinstance(index, tuple) else (index,)
+        first, *rest = (index if isinstance(index, tuple) else (index,)) or (...,)
+        if first is Ellipsis:
+            first, rest = slice(None), [..., *rest]
         numbers = np.arange(self.shape[0])[first]
         if numbers.ndim == 0:
             picture: NDArray[Any] = self.picture(int(numbers))[tuple(rest)]

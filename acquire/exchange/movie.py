@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 from fractions import Fraction
+from itertools import count
+from math import gcd
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -71,8 +73,10 @@ def write_movie(
 
 def _white(content: Content) -> float:
     """Return a value close to the brightest voxel, from a sample of every block."""
-    found = [0.0]
+    found, columns = [0.0], content.image.shape[-1]
     for _, block in content.image.blocks():
-        some = block.reshape(-1)[:: max(1, block.size // SAMPLED)]
+        # A step that has a factor in common with the width would never see some of the columns.
+        steps = count(max(1, block.size // SAMPLED))
+        some = block.reshape(-1)[:: next(step for step in steps if gcd(step, columns) == 1)]
         found.append(float(np.quantile(some, PEAK_QUANTILE)))
     return max(found) or 1.0

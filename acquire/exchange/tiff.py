@@ -15,6 +15,7 @@ import numpy as np
 
 from acquire.errors import UsageError
 from acquire.exchange.libraries import library
+from acquire.text import visible
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -73,8 +74,10 @@ def _imagej(content: Content) -> dict[str, Any]:
     facts: dict[str, Any] = {"axes": AXES[content.kind], "Info": json.dumps(content.facts, indent=1)}
     if content.kind == "lines":
         return {**facts, "Labels": [f"arm {arm}" for arm in content.facts["arms"]]}
-    time = content.axes[0]
-    return {**facts, "finterval": time.step, "fps": 1 / (time.step or 1.0), "unit": content.axes[-1].unit}
+    time, unit = content.axes[0], content.axes[-1].unit
+    # ImageJ's description is ASCII, and it reads other characters in this form.
+    plain = "".join(each if each.isascii() else f"\\u{ord(each):04X}" for each in visible(unit))
+    return {**facts, "finterval": time.step, "fps": 1 / (time.step or 1.0), "unit": plain}
 
 
 def _ome(content: Content) -> dict[str, Any]:

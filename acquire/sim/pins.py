@@ -124,7 +124,11 @@ class PinPage:
         fields = self._await_light(run, start + length)
         index = np.arange(start, start + length)
         lit = self._light[index % ROOM] * ((index >= 0) & (index < int(fields[_SUBSTEPS])))
-        if int(self.read()[_SUBSTEPS]) - max(start, 0) > ROOM:
+        # What was written over it in the meantime may be of the same run or of the next one.
+        now = self.read()
+        if now[_RUN] != run:
+            raise _over(run)
+        if int(now[_SUBSTEPS]) - max(start, 0) > ROOM:
             raise DeviceError(f"a camera asked too late for the light of sub-step {start}")
         return lit.astype(np.uint8)
 
@@ -134,7 +138,7 @@ class PinPage:
         while time.monotonic() < deadline_s:
             fields = self.read()
             if fields[_RUN] != run:
-                raise DeviceError(f"run {run} of the trigger is over, and its light is no longer kept")
+                raise _over(run)
             if fields[_SUBSTEPS] >= end or not fields[_RUNNING]:
                 return fields
             time.sleep(_POLL_S)
@@ -197,6 +201,10 @@ class PinCode:
 
     def to_attrs(self) -> dict[str, Any]:
         return {"kind": "pins", "run": self.run}
+
+
+def _over(run: int) -> DeviceError:
+    return DeviceError(f"run {run} of the trigger is over, and its light is no longer kept")
 
 
 def _receive(duplicate: Any) -> PinPage:

@@ -106,7 +106,8 @@ def _spawn(clock_hz: int, pins: PinPage | None, *more: str) -> subprocess.Popen[
         inherited.append(pins.descriptor)
     path = os.pathsep.join(filter(None, (str(ROOT), os.environ.get("PYTHONPATH"))))
     return subprocess.Popen(  # noqa: S603 - this interpreter and module
-        [sys.executable, "-m", "firmware.twin", *options],
+        # -P: the current directory is not searched, which may hold a folder `firmware` of another project
+        [sys.executable, "-P", "-m", "firmware.twin", *options],
         env={**os.environ, "PYTHONPATH": path},
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
@@ -123,12 +124,14 @@ def _first_report(process: subprocess.Popen[bytes]) -> dict[str, Any]:
         if select.select([process.stdout], [], [], left_s)[0]:
             piece = os.read(process.stdout.fileno(), 4096)
             if not piece:
-                break
+                raise TriggerError(
+                    "the gateware's process ended before it could report anything",
+                    hint="python -m firmware.twin, which shows why",
+                )
             line += piece
-    try:
-        report: dict[str, Any] = json.loads(line)
-    except ValueError:
-        raise TriggerError(f"the gateware's process did not start within {_START_S:g} s") from None
+    if not line.endswith(b"\n"):
+        raise TriggerError(f"the gateware's process did not start within {_START_S:g} s")
+    report: dict[str, Any] = json.loads(line)
     if "error" in report:
         raise TriggerError(f"the gateware's process ended: {report['error']}")
     return report

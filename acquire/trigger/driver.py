@@ -176,10 +176,10 @@ class TriggerDriver:
         """End the run after a whole line; return the number of lines. Idempotent."""
         with self._lock:
             run, self._prepared = self._run or self._prepared, None
-            if self._device is None:
+            if self._device is None and not self._owed:
                 return 0
-            # Noted before the link is used: if it fails, the next `prepare` ends this run first.
-            self._owed = run_number(run.run_id) if run else 0
+            # Noted before the link is used: if it fails, the next `stop` or `prepare` ends this run.
+            self._owed = run_number(run.run_id) if run else self._owed
             device = self._living()
             # 0, any run: a device that was restarted in the meantime would refuse to stop one that it lacks.
             device.command(Command.STOP, 0)

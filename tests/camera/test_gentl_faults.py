@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import ctypes
+import subprocess
+import sys
 import time
 from collections.abc import Callable, Iterator
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -14,9 +18,10 @@ from acquire.camera.base import CameraLoss, LossCause
 from acquire.camera.harvesters import HarvestersCamera, list_cameras
 from acquire.camera.settings import Setting
 from acquire.camera.spec import GenicamSpec
-from acquire.errors import CameraError, CameraLostError
+from acquire.errors import CameraError, CameraLostError, PlaceError, UsageError
 from acquire.lines import LineFlag
 from acquire.sim.gentl.bench import GentlBench
+from acquire.sim.gentl.build import build
 from acquire.sim.gentl.memory import CameraMemory
 from acquire.sim.gentl.models import CameraModel
 
@@ -268,3 +273,47 @@ def test_a_thousand_starts_are_as_good_as_one(open_camera: Any) -> None:
     after = process.memory_info().rss, process.num_fds(), process.num_threads()
     assert after[1:] == before[1:]
     assert after[0] - before[0] < 4 << 20
+
+
+@pytest.mark.parametrize("serial", ["", "a/b", "nul\0", "x" * 64, "é" * 32])
+def test_a_serial_that_cannot_name_a_file_is_refused(serial: str) -> None:
+    with pytest.raises(UsageError, match="possible: 1 to 63 bytes without a slash"):
+        GentlBench({CameraModel(serial, WIDTH): RampOpener(RATE_HZ)})
+
+
+LOOK = """
+import ctypes, sys
+producer, card = ctypes.CDLL(sys.argv[1]), ctypes.c_void_p()
+assert producer.GCInitLib() == 0 and producer.TLOpen(ctypes.byref(card)) == 0
+assert producer.TLOpenInterface(card, b"card0", ctypes.byref(card)) == 0
+print(flush=True)
+kind, access, size = ctypes.c_int32(), ctypes.c_int32(), ctypes.c_size_t(4)
+while True:
+    producer.IFGetDeviceInfo(card, b"SIM-64", 5, *map(ctypes.byref, (kind, access, size)))
+"""
+
+
+def test_a_camera_can_be_opened_while_others_look_at_it(bench: GentlBench) -> None:
+    """Whoever asked whether a camera is free held it for that moment, so that nobody could open it."""
+    producer = ctypes.CDLL(str(bench.cti))
+    system, card, camera = ctypes.c_void_p(), ctypes.c_void_p(), ctypes.c_void_p()
+    assert producer.GCInitLib() == producer.TLOpen(ctypes.byref(system)) == 0
+    assert producer.TLOpenInterface(system, b"card0", ctypes.byref(card)) == 0
+    looking = subprocess.Popen([sys.executable, "-c", LOOK, str(bench.cti)], stdout=subprocess.PIPE)
+    try:
+        assert looking.stdout is not None
+        assert looking.stdout.readline()
+        for _ in range(10_000):
+            assert producer.IFOpenDevice(card, b"SIM-64", 4, ctypes.byref(camera)) == 0
+            assert producer.DevClose(camera) == 0
+    finally:
+        looking.kill()
+        looking.communicate()
+        assert producer.IFClose(card) == producer.TLClose(system) == producer.GCCloseLib() == 0
+
+
+def test_a_cache_that_cannot_be_written_is_named(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    (tmp_path / "cache").touch()
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    with pytest.raises(PlaceError, match=r"cache/tdi-acquire cannot be written: .*XDG_CACHE_HOME"):
+        build()

@@ -42,9 +42,13 @@ def test_parts_are_measured_where_it_is_recorded(tmp_path: Path) -> None:
 
 
 def test_the_remains_of_a_killed_measurement_are_removed(tmp_path: Path) -> None:
-    (tmp_path / ".capacity-4194305.zarr" / "a").mkdir(parents=True)  # above the largest process number
+    dead = 4194305  # above the largest process number
+    for kind in ("capacity", "load"):
+        (tmp_path / f".{kind}-{dead}.zarr" / "a").mkdir(parents=True)
+        (tmp_path / f".{kind}-1.zarr").mkdir()
     measure_parts(SMALL, tmp_path)
-    assert not any(tmp_path.iterdir())
+    run_load(SMALL, tmp_path, 0.1)
+    assert {path.name for path in tmp_path.iterdir()} == {".capacity-1.zarr", ".load-1.zarr"}
 
 
 def test_processors_are_shared_by_all_parts() -> None:

@@ -91,6 +91,10 @@ def test_bad_files_name_the_key(cli: Cli, rig_file: Path, before: str, after: st
             "light.close_ticks = 450\ndriver = 'rtl'",
             "trigger.light.open_ticks, light.close_ticks cannot be simulated",
         ),
+        (
+            "light.lead_ticks = 31\ndriver = 'rtl'",
+            "trigger.light.lead_ticks = 31 cannot be simulated; possible: 0, or driver = 'simulated'",
+        ),
         ("driver = 'serial'\nurl = '/dev/ttyUSB0'", "trigger.driver = 'serial' cannot be simulated"),
         ("driver = 'serial'", "driver 'serial' needs a url"),
         (

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import json
+import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -26,7 +27,8 @@ from acquire.exchange import (
     video_content,
 )
 from acquire.lines import LineFlag
-from acquire.store import open_recording, open_video
+from acquire.store import open_recording, open_video, write_video
+from acquire.store.present import flags_of
 
 FIRST, M, S, TRUSTED = 100, 6, 2, range(3, 17)
 Cli = Callable[..., tuple[int, str, str]]
@@ -154,6 +156,35 @@ def test_frames_that_are_not_trusted_are_left_out_or_named(cli: Cli, video: Path
         assert json.loads(str(saved["facts"]))["frames"] == [3, 8]
 
 
+SUFFIXES = (".tif", ".ome.tif", ".h5", ".npz", ".mp4")
+
+
+@pytest.mark.parametrize("suffix", SUFFIXES)
+@pytest.mark.parametrize(("frames", "trusted"), [(range(3), [3, 3]), (range(18, 20), [0, 0])])
+def test_frames_of_which_none_is_trusted_are_written(
+    video: Path, tmp_path: Path, frames: range, trusted: list[int], suffix: str
+) -> None:
+    content = video_content(open_video(video), "v", frames, whole=True)
+    assert (content.facts["trusted_frames"], content.untrusted) == (trusted, len(frames))
+    assert export(content, tmp_path / f"v{suffix}") > 0
+
+
+@pytest.mark.parametrize("suffix", SUFFIXES)
+def test_odd_names_and_units_are_escaped_where_a_format_cannot_hold_them(tmp_path: Path, suffix: str) -> None:
+    frames, time_ns = np.ones((3, 7, 5), np.float32), np.arange(3, dtype=np.int64)
+    write_video(tmp_path / "video.zarr", frames, time_ns, 2.5, 1, {}, pixel_unit="µm")
+    out = tmp_path / f"Gerät 1{suffix}"
+    assert export(video_content(open_video(tmp_path / "video.zarr"), "caf\udce9 \x01é"), out) > 0
+    if suffix == ".tif":
+        with tifffile.TiffFile(out) as file:
+            assert file.imagej_metadata is not None
+            assert file.imagej_metadata["unit"] == r"\u00B5m"
+    elif suffix == ".ome.tif":
+        with tifffile.TiffFile(out) as file:
+            image = tifffile.xml2dict(file.ome_metadata)["OME"]["Image"]
+        assert (image["Name"], image["Pixels"]["PhysicalSizeXUnit"]) == (r"caf\udce9 \x01é", "µm")
+
+
 def test_times_choose_frames(cli: Cli, video: Path, tmp_path: Path) -> None:
     utc = "2023-11-14T22:13:20.000120"  # 12 frames after the first
     assert cli("export", video, tmp_path / "v.npz", "--from", "50us", "--to", utc)[0] == 0
@@ -176,6 +207,17 @@ def test_a_movie_shows_what_the_video_holds(
     error = middle / 255 - open_video(video).video[3:17]
     assert np.sqrt(np.mean(error**2)) < (0.02 if times > 1 else 0.1)  # fine noise is lost in coding
     assert (facts["white"], facts["frames"], facts["enlarged"]) == (1.0, [3, 17], times)
+
+
+@pytest.mark.parametrize("column", [0, 5, 17])
+def test_white_is_found_wherever_it_is(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, column: int) -> None:
+    frames, time_ns = np.full((2, 64, 32), 0.01, np.float32), np.arange(2, dtype=np.int64)
+    frames[:, :, column] = 1
+    write_video(tmp_path / "video.zarr", frames, time_ns, 2.5, 1, {})
+    monkeypatch.setattr(movie, "SAMPLED", 2 * 64 * 2)  # every 16th voxel: of two columns of 32
+    export(video_content(open_video(tmp_path / "video.zarr"), "v"), tmp_path / "v.mp4")
+    with av.open(str(tmp_path / "v.mp4")) as file:
+        assert json.loads(file.metadata["comment"])["white"] == 1.0
 
 
 @pytest.mark.parametrize("block_bytes", [200, 2**23])
@@ -241,6 +283,30 @@ def test_an_overview_is_the_mean_of_the_lines_that_are_there(
         assert not saved["lines"][1, 0].any()
 
 
+@pytest.mark.parametrize("step", [40, 90, 1000])
+def test_an_overview_does_not_read_a_long_group_of_lines_at_once(
+    recording: Path, monkeypatch: pytest.MonkeyPatch, step: int
+) -> None:
+    opened, most, read = open_recording(recording), 7, []
+    content = recording_content(opened, range(2, 90, step))
+
+    def exported() -> list[Any]:
+        arrays = (content.image, *content.columns)
+        return [np.concatenate([values for _, values in array.blocks()]) for array in arrays]
+
+    at_once = exported()
+
+    def observed(opened: Any, arm: str, start: int, stop: int) -> Any:
+        read.append(stop - start)
+        return flags_of(opened, arm, start, stop)
+
+    monkeypatch.setattr(from_recording, "BLOCK_BYTES", most * 2 * M)
+    monkeypatch.setattr(from_recording, "flags_of", observed)
+    for in_parts, whole in zip(exported(), at_once, strict=True):
+        np.testing.assert_array_equal(in_parts, whole)
+    assert max(read) <= most
+
+
 def test_damaged_lines_are_left_out_of_averages() -> None:
     damaged, missing = LineFlag.INCOMPLETE, LineFlag.MISSING
     lines = np.repeat(np.arange(1, 9, dtype=np.uint16)[:, None], 3, axis=1)
@@ -276,13 +342,22 @@ def test_times_choose_lines(cli: Cli, recording: Path, tmp_path: Path) -> None:
         (["video", "v.mp4", "--peak", -1], "above 0"),
         (["nothing", "v.npy"], "does not exist"),
         (["video", "no/v.npy"], "does not exist"),
+        (["video", "."], "cannot be taken from its name"),
+        (["video", ".."], "cannot be taken from its name"),
     ],
 )
 def test_impossible_requests_are_refused_and_nothing_is_changed(
-    cli: Cli, recording: Path, video: Path, tmp_path: Path, words: list[Any], said: str
+    cli: Cli,
+    recording: Path,
+    video: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    words: list[Any],
+    said: str,
 ) -> None:
     source = {"run": recording, "video": video}.get(words[0], tmp_path / "absent.zarr")
-    code, _, err = cli("export", source, tmp_path / words[1], *words[2:])
+    monkeypatch.chdir(tmp_path)
+    code, _, err = cli("export", source, words[1], *words[2:])
     assert (code, said in err) == (2, True), err
     assert not list(tmp_path.iterdir())
 
@@ -321,3 +396,20 @@ def test_a_full_disk_leaves_nothing(video: Path, tmp_path: Path, monkeypatch: py
     with pytest.raises(Exception, match="No space left"):
         export(video_content(open_video(video), "v"), tmp_path / "v.npy")
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("most_bytes", [0, 3000, 20_000])
+@pytest.mark.parametrize("suffix", SUFFIXES)
+def test_a_disk_that_takes_no_more_is_an_error_and_not_the_end_of_the_process(
+    tmp_path: Path, suffix: str, most_bytes: int
+) -> None:
+    """HDF5 itself crashes when it closes a file that it cannot write."""
+    frames = np.random.default_rng(8).random((8, 64, 64)).astype(np.float32)
+    write_video(tmp_path / "v.zarr", frames, np.arange(8, dtype=np.int64), 2.5, 1, {})
+    limited = f"import resource; resource.setrlimit(resource.RLIMIT_FSIZE, ({most_bytes}, -1));"
+    program = [sys.executable, "-c", f"{limited} from acquire.cli import main; raise SystemExit(main())"]
+    words = ["export", str(tmp_path / "v.zarr"), str(tmp_path / f"v{suffix}")]
+    done = subprocess.run([*program, *words], capture_output=True, text=True, check=False)
+    assert (done.returncode, "File too large" in done.stderr) == (5, True), done.stderr
+    assert "Traceback" not in done.stderr
+    assert [path.name for path in tmp_path.iterdir()] == ["v.zarr"]

@@ -73,3 +73,24 @@ def test_arms_read_in_turn_unpack_each_page_once(tmp_path: Path, monkeypatch: py
                 part = found.rows(arm, start, start + 16)
                 np.testing.assert_array_equal(part, lines[arm, start : start + 16])
     assert unpacked == [0, 1]
+
+
+@pytest.mark.parametrize("arms", [(), (1,), (2,)])
+def test_a_numpy_file_in_fortran_order_is_read_and_may_be_cut_short(
+    tmp_path: Path, arms: tuple[int, ...]
+) -> None:
+    """A mapped file that shrinks, or whose disk fails, ends the process with SIGBUS."""
+    path, lines = (
+        tmp_path / "lines.npy",
+        np.random.default_rng(5).integers(0, 200, (*arms, 3000, 8), np.uint16),
+    )
+    np.save(path, np.asfortranarray(lines))
+    with open_lines(path, Layout()) as found:
+        for arm in range(*arms) if arms else (None,):
+            expected = lines if arm is None else lines[arm]
+            for start, stop in ((0, 3000), (7, 8), (2990, 3000)):
+                np.testing.assert_array_equal(found.rows(arm, start, stop), expected[start:stop])
+        with path.open("r+b") as file:
+            file.truncate(path.stat().st_size // 2)
+        with pytest.raises(DataError, match="ends before line 3000: it was cut short"):
+            found.rows(0 if arms else None, 100, 3000)

@@ -17,7 +17,8 @@ import tifffile
 from acquire.cli import main
 from acquire.codes import mix_seed
 from acquire.config import load_rig, load_scene
-from acquire.exchange import importing
+from acquire.errors import UsageError
+from acquire.exchange import Layout, importing, open_lines
 from acquire.lines import ARMS, LineFlag
 from acquire.recon import reconstruct
 from acquire.simulate import simulate
@@ -193,6 +194,31 @@ def test_lines_from_the_middle_of_a_run_have_its_code(
         found = open_recording(tmp_path / f"{name}.zarr").cut(first, 60)
         np.testing.assert_array_equal(found.code, expected.code)
         np.testing.assert_array_equal(found.lines, expected.lines)
+
+
+@pytest.mark.parametrize("compression", [None, "zlib"])
+@pytest.mark.parametrize("sizes", [[60, 60, 30], [75, 75], [1] * 5])
+def test_lines_in_several_images_of_a_tiff_file_are_refused(
+    tmp_path: Path, compression: str | None, sizes: list[int]
+) -> None:
+    """Only the first image would be imported, and the other lines lost without a word."""
+    with tifffile.TiffWriter(tmp_path / "a.tif") as file:
+        for size in sizes:
+            file.write(np.ones((size, STAGES), np.uint16), compression=compression, contiguous=False)
+    with (
+        pytest.raises(UsageError, match=f"{len(sizes)} images of lines, .* {sizes[0]} x {STAGES}, "),
+        open_lines(tmp_path / "a.tif", Layout()),
+    ):
+        pass
+
+
+def test_a_thumbnail_beside_the_lines_of_a_tiff_file_does_no_harm(tmp_path: Path) -> None:
+    lines = np.arange(30 * STAGES, dtype=np.uint16).reshape(30, STAGES)
+    with tifffile.TiffWriter(tmp_path / "a.tif") as file:
+        file.write(lines)
+        file.write(lines[:4, :4].astype(np.uint8))
+    with open_lines(tmp_path / "a.tif", Layout()) as opened:
+        np.testing.assert_array_equal(opened.rows(None, 0, 30), lines)
 
 
 @pytest.mark.parametrize(

@@ -6,6 +6,7 @@ import importlib
 import json
 import tomllib
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -13,6 +14,7 @@ import zarr
 
 from acquire.errors import UsageError
 from acquire.exchange import lazy
+from acquire.exchange.lazy import Stack
 from acquire.exchange.napari_reader import reader_for
 from acquire.store import open_recording, open_video, write_video
 
@@ -104,6 +106,15 @@ def test_only_displayed_data_are_read(recording: Path, monkeypatch: pytest.Monke
     with pytest.raises(UsageError, match="9 pictures at once would be 1080 bytes"):
         stack[:]
     assert read_rows == [70]
+
+
+@pytest.mark.parametrize(
+    "index", [np.s_[...], np.s_[..., 2], np.s_[..., 1:, ::2], np.s_[1:3, ..., 0], np.s_[:, 4], np.s_[-1], ()]
+)
+def test_pictures_are_sliced_like_an_array(index: Any) -> None:
+    pictures = np.arange(6 * 5 * 4).reshape(6, 5, 4)
+    stack = Stack(pictures.shape, pictures.dtype, lambda number: pictures[number])
+    np.testing.assert_array_equal(stack[index], pictures[index])
 
 
 def test_foreign_files_are_left_to_other_readers(tmp_path: Path) -> None:

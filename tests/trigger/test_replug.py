@@ -127,6 +127,30 @@ def test_a_stop_that_did_not_reach_the_device_is_repeated(cable, driver) -> None
     assert driver.tags(5.0)[0].line == 0
 
 
+def test_a_stop_that_did_not_reach_the_device_can_be_repeated_itself(cable, driver) -> None:
+    """The second one returned at once, without a word, while the light went on flashing."""
+    lose_it(cable, driver)
+    for _ in range(2):
+        with pytest.raises(TriggerError, match="is not there"):
+            driver.stop()
+    cable.plug()
+    assert driver.stop() > 100
+    assert driver.device().status().state == State.ENDED
+    driver.release()
+    assert driver.stop() == 0, "a run that has been stopped is not stopped again"
+
+
+def test_a_stop_of_an_armed_run_is_owed_however_often_it_fails(cable, driver) -> None:
+    driver.prepare(run())
+    cable.unplug()
+    for _ in range(3):
+        with pytest.raises(TriggerError, match=r"is not there|is gone"):
+            driver.stop()
+    cable.plug()
+    driver.prepare(run("next"))
+    assert driver.device().status().state == State.ARMED
+
+
 def test_a_stop_connects_again_to_switch_the_light_off(cable, driver) -> None:
     lose_it(cable, driver)
     cable.plug()

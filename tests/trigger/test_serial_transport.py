@@ -8,7 +8,9 @@ import sys
 import termios
 import threading
 import time
-from contextlib import suppress
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
 
 import pytest
 import serial
@@ -19,7 +21,7 @@ from acquire.config.device import TriggerConfig
 from acquire.errors import TriggerError
 from acquire.sim.twin_links import PtyTwin
 from acquire.trigger.driver import TriggerDriver
-from acquire.trigger.transports.lock import PortLock
+from acquire.trigger.transports.lock import PortLock, lock_directory
 from acquire.trigger.transports.serial import FoundPort, SerialTransport, list_ports
 
 
@@ -92,6 +94,50 @@ def test_a_port_has_one_user_and_the_error_names_it_to_the_second(tmp_path) -> N
     PortLock(path).release()
     ours.close()
     theirs.close()
+
+
+def test_a_port_that_is_only_looked_at_can_be_opened(tmp_path) -> None:
+    """Whoever lists the ports holds the lock of each for a moment."""
+    path = str(tmp_path / "tty")
+    with _held_elsewhere(path) as held:
+        ending = threading.Timer(0.02, os.close, [held])
+        ending.start()
+        PortLock(path).release()
+        ending.join()
+
+
+def test_a_holder_that_has_not_said_who_it_is_is_unknown(tmp_path) -> None:
+    path = str(tmp_path / "tty")
+    with _held_elsewhere(path) as held:
+        with pytest.raises(TriggerError, match=f"{path} is in use by process unknown;"):
+            PortLock(path)
+        os.close(held)
+
+
+@contextmanager
+def _held_elsewhere(path: str) -> Iterator[int]:
+    """The lock's file, held by a descriptor that the block closes, and without a number in it."""
+    PortLock(path).release()
+    (file,) = lock_directory().glob(f"*{Path(path).parent.name.replace('_', '-')}-tty.lock")
+    held = os.open(file, os.O_RDWR | os.O_TRUNC)
+    fcntl.flock(held, fcntl.LOCK_EX)
+    yield held
+
+
+def test_a_port_that_vanishes_while_it_is_opened_is_not_held_for_ever(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def gone(*_: object) -> None:
+        raise termios.error(errno.EIO, "Input/output error")
+
+    with wired_model() as model:
+        twin = PtyTwin(model)
+        with monkeypatch.context() as patched:
+            patched.setattr(termios, "tcflush", gone)
+            with pytest.raises(TriggerError, match=f"{twin.path} cannot be opened: .*Input/output error"):
+                SerialTransport(twin.path, 3_000_000)
+        SerialTransport(twin.path, 3_000_000).close()
+        twin.close()
 
 
 def test_two_drivers_on_one_port() -> None:

@@ -19,6 +19,7 @@ from acquire.sim.gentl import layout
 from acquire.sim.gentl.build import build
 from acquire.sim.gentl.feeder import feed
 from acquire.sim.gentl.memory import CameraMemory, host_ports
+from acquire.text import shortened
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
@@ -39,7 +40,8 @@ class GentlBench:
     cameras : model of each camera → opener of its sensor, which is called in a separate process
     life : main function of such a process, `acquire.sim.gentl.feeder.feed` except in tests
 
-    Raises DeviceError without a C compiler, and leaves nothing behind; UsageError for equal serials.
+    Raises DeviceError without a C compiler, and leaves nothing behind; UsageError for equal serials, or
+    one that cannot be a file's name.
     """
 
     def __init__(self, cameras: Mapping[CameraModel, Any], life: Callable[..., None] = feed) -> None:
@@ -50,6 +52,12 @@ class GentlBench:
                 f"simulated cameras cannot have the serials {', '.join(serials)}",
                 possible="a different serial for each",
             )
+        for serial in serials:
+            if "/" in serial or "\0" in serial or not 0 < len(serial.encode()) < layout.TEXT_BYTES:
+                raise UsageError(
+                    f"a simulated GenTL camera cannot have the serial {shortened(serial)!r}",
+                    possible=f"1 to {layout.TEXT_BYTES - 1} bytes without a slash: it names a file",
+                )
         self._directory = Path(tempfile.mkdtemp(prefix="acquire-gentl-"))
         self.cameras: dict[str, CameraMemory] = {}
         self._feeders: list[Worker] = []

@@ -14,6 +14,7 @@ from pathlib import Path
 
 from acquire.errors import DeviceError
 from acquire.sim.gentl.layout import header
+from acquire.store.refusals import refused
 
 SOURCE = Path(__file__).with_name("producer.c")
 OPTIONS = (
@@ -28,6 +29,7 @@ OPTIONS = (
     "-ldl",
 )
 COMPILE_S = 120.0
+CACHE_HINT = "XDG_CACHE_HOME, another directory for what is compiled"
 
 
 def compiler() -> str | None:
@@ -37,7 +39,10 @@ def compiler() -> str | None:
 
 
 def build() -> Path:
-    """Return the producer's .cti, which is compiled if necessary. Raises DeviceError without a compiler."""
+    """Return the producer's .cti, which is compiled if necessary.
+
+    Raises DeviceError without a compiler, PlaceError or StoreError if the cache directory cannot be written.
+    """
     found = compiler()
     if found is None:
         raise DeviceError(
@@ -51,20 +56,25 @@ def build() -> Path:
     cache = (Path(base) if base else Path.home() / ".cache") / "tdi-acquire"
     target = cache / f"acquire-simulated-{digest[:16]}.cti"
     if not target.is_file():
-        target.parent.mkdir(parents=True, exist_ok=True)
-        # Compiled into a directory next to the target, then moved: concurrent builds both succeed.
-        with tempfile.TemporaryDirectory(dir=target.parent) as name:
-            directory = Path(name)
-            (directory / "layout.h").write_text(header())
-            made = directory / target.name
-            command = [found, *OPTIONS, f"-I{directory}", "-o", str(made), str(SOURCE)]
-            done = subprocess.run(  # noqa: S603 - the user's own compiler
-                command, capture_output=True, text=True, timeout=COMPILE_S, check=False
-            )
-            if done.returncode:
-                raise DeviceError(f"{found} failed to compile the producer: {done.stderr.strip()[-2000:]}")
-            made.replace(target)
+        with refused(target.parent, "written", hint=CACHE_HINT):
+            _compile(found, target)
     return target
+
+
+def _compile(found: str, target: Path) -> None:
+    target.parent.mkdir(parents=True, exist_ok=True)
+    # Compiled into a directory next to the target, then moved: concurrent builds both succeed.
+    with tempfile.TemporaryDirectory(dir=target.parent) as name:
+        directory = Path(name)
+        (directory / "layout.h").write_text(header())
+        made = directory / target.name
+        command = [found, *OPTIONS, f"-I{directory}", "-o", str(made), str(SOURCE)]
+        done = subprocess.run(  # noqa: S603 - the user's own compiler
+            command, capture_output=True, text=True, timeout=COMPILE_S, check=False
+        )
+        if done.returncode:
+            raise DeviceError(f"{found} failed to compile the producer: {done.stderr.strip()[-2000:]}")
+        made.replace(target)
 
 
 if __name__ == "__main__":

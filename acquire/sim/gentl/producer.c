@@ -21,7 +21,6 @@
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
-#include <sys/file.h>
 #include <sys/mman.h>
 #include <sys/stat.h>
 #include <time.h>
@@ -534,14 +533,23 @@ API gc_error IFGetDeviceID(void *handle, uint32_t index, char *id, size_t *size)
     return give_text(NULL, id, size, card.ids[index]);
 }
 
+/* A lock of the open file, which ends with it. Unlike flock(2), it can be looked at without being taken: a camera
+ * that is only looked at can be opened at that moment. */
+static struct flock whole_file(void) { return (struct flock){.l_type = F_WRLCK, .l_whence = SEEK_SET}; }
+
+static int lock(int fd)
+{
+    struct flock all = whole_file();
+    return fcntl(fd, F_OFD_SETLK, &all);
+}
+
 /* 1: free, 5: open here, 4: open somewhere else */
 static int32_t access_status(const char *serial, int fd)
 {
+    struct flock held = whole_file();
     for (int k = 0; k < MAX_CAMERAS; k++)
         if (devices[k].open && !strcmp(devices[k].serial, serial)) return 5;
-    if (flock(fd, LOCK_EX | LOCK_NB)) return 4;
-    flock(fd, LOCK_UN);
-    return 1;
+    return fcntl(fd, F_OFD_GETLK, &held) || held.l_type != F_UNLCK ? 4 : 1;
 }
 
 static gc_error device_info(const word *words, int fd, const char *serial, int32_t what, int32_t *type, void *out, size_t *size)
@@ -589,7 +597,7 @@ static gc_error open_device(struct device *d, const char *serial)
         if (d->words) forget(d->words, d->fd, d->size);
         return fail(E_ID, "there is no camera %s", serial);
     }
-    if (flock(d->fd, LOCK_EX | LOCK_NB)) {
+    if (lock(d->fd)) {
         forget(d->words, d->fd, d->size);
         return fail(E_ACCESS, "camera %s is open in another process", serial);
     }

@@ -9,12 +9,16 @@ import fcntl
 import os
 import re
 import tempfile
+import time
 from pathlib import Path
 
 from acquire.errors import TriggerError
 
 SHARED = Path("/run/lock")
 _COMMAND_SHOWN = 80
+_LOOKED_AT_S = 0.1
+"""Longest time for which a program that only lists the ports holds a lock."""
+_LOOK_AGAIN_S = 0.0005
 
 
 class PortLock:
@@ -28,7 +32,7 @@ class PortLock:
             raise TriggerError(f"{port} cannot be locked: {path}: {error.strerror}") from error
         # flock, not a file with a number in it: the kernel releases it with the process, however that ends.
         try:
-            fcntl.flock(self._descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            self._take()
         except OSError as error:
             holder = os.pread(self._descriptor, 32, 0).decode(errors="replace").strip()
             self.release()
@@ -39,6 +43,19 @@ class PortLock:
         os.ftruncate(self._descriptor, 0)
         os.pwrite(self._descriptor, f"{os.getpid()}\n".encode(), 0)
 
+    def _take(self) -> None:
+        """Take the lock; raise BlockingIOError if it is held for longer than `holder_of` holds it."""
+        deadline_s = time.monotonic() + _LOOKED_AT_S
+        while True:
+            try:
+                fcntl.flock(self._descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                if time.monotonic() > deadline_s:
+                    raise
+                time.sleep(_LOOK_AGAIN_S)
+            else:
+                return
+
     def release(self) -> None:
         """Release the lock. Idempotent."""
         # The file stays: removing it would let two processes lock two files of the same name.
@@ -48,7 +65,7 @@ class PortLock:
 
 
 def holder_of(port: str) -> str:
-    """Return ``in use by process 1234 (…)``, or "", without waiting and without keeping the lock."""
+    """Return ``in use by process 1234 (…)``, or "", without keeping the lock."""
     try:
         PortLock(port).release()
     except TriggerError as error:
@@ -77,8 +94,10 @@ def _open_for_all(path: Path) -> int:
 
 def _describe(pid: str) -> str:
     """Return a text such as ``1234 (acquire serve rig.toml)``."""
+    if not pid.isdecimal():  # the holder has not written its number yet
+        return "unknown"
     try:
         command = Path("/proc", pid, "cmdline").read_bytes().replace(b"\0", b" ").decode(errors="replace")
     except OSError:
-        return pid or "unknown"
+        return pid
     return f"{pid} ({command.strip()[:_COMMAND_SHOWN]})"

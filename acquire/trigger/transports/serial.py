@@ -4,6 +4,7 @@ terminal."""
 from __future__ import annotations
 
 import errno
+import termios
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -58,7 +59,8 @@ class SerialTransport:
                 url, baudrate=baud, timeout=READ_WAIT_S, write_timeout=_WRITE_S, rtscts=rts_cts
             )
             self._port.reset_input_buffer()  # drops answers to the previous user of the port
-        except (OSError, ValueError) as error:  # SerialException is an OSError
+        # SerialException is an OSError; termios.error, of a port that vanishes while it is set up, is not
+        except (OSError, ValueError, termios.error) as error:
             self._lock.release()
             raise _not_opened(url, error, local) from error
 
@@ -101,7 +103,7 @@ def _lock_name(path: str) -> str:
     return str(Path(path).resolve())
 
 
-def _not_opened(url: str, error: OSError | ValueError, local: bool) -> TriggerError:
+def _not_opened(url: str, error: Exception, local: bool) -> TriggerError:
     """Return the error with advice for its cause: no permission, a wrong address, or a missing port."""
     if getattr(error, "errno", None) in (errno.EACCES, errno.EPERM):
         return TriggerError(f"{url} may not be opened: permission denied", hint=UDEV_HINT)

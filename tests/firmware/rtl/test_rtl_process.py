@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 from waiting import until
 
 import acquire.sim.rtl
@@ -91,6 +92,23 @@ def test_reading_light_that_was_discarded_is_an_error(page: PinPage) -> None:
         page.light(2, 0, 5)
 
 
+def test_light_that_the_next_run_overwrites_while_it_is_read_is_an_error(
+    page: PinPage, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    awaited = page._await_light
+
+    def then_overwritten(run: int, end: int) -> NDArray[np.uint64]:
+        fields = awaited(run, end)
+        page.publish(PinRun(2, True, (1, 1), 60), bytes(50), CLOCK_HZ)
+        return fields
+
+    page.publish(PinRun(1, False, (5, 5), 60), bytes([1]) * 100, CLOCK_HZ)
+    assert page.light(1, 0, 100).all()
+    monkeypatch.setattr(page, "_await_light", then_overwritten)
+    with pytest.raises(DeviceError, match="run 1 of the trigger is over"):
+        page.light(1, 0, 100)
+
+
 def test_it_ends_when_its_owner_is_killed() -> None:
     text = (
         "import time\n"
@@ -138,6 +156,34 @@ def test_without_a_compiler_the_rig_says_what_to_install(
     monkeypatch.setattr(acquire.sim.rtl, "ROOT", tmp_path)
     with pytest.raises(UsageError, match="which are in a checkout"):
         RtlTransport(CLOCK_HZ)
+
+
+def test_a_cache_that_cannot_be_written_is_named(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    (tmp_path / "cache").touch()
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    with pytest.raises(TriggerError, match=r"cache/acquire/rtl cannot be written: .*XDG_CACHE_HOME"):
+        RtlTransport(CLOCK_HZ)
+
+
+def test_a_process_that_dies_at_its_start_is_not_said_to_be_slow(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    (tmp_path / "firmware").mkdir()
+    (tmp_path / "firmware" / "__init__.py").touch()
+    (tmp_path / "firmware" / "twin.py").write_text("raise SystemExit(3)")
+    monkeypatch.setattr(acquire.sim.rtl, "ROOT", tmp_path)
+    monkeypatch.delenv("PYTHONPATH", raising=False)
+    with pytest.raises(TriggerError, match="ended before it could report anything"):
+        RtlTransport(CLOCK_HZ)
+
+
+def test_a_folder_of_the_same_name_where_one_works_does_no_harm(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    (tmp_path / "firmware").mkdir()
+    (tmp_path / "firmware" / "__init__.py").write_text("raise SystemExit('of another project')")
+    monkeypatch.chdir(tmp_path)
+    RtlTransport(CLOCK_HZ).close()
 
 
 def test_the_demo_records_from_the_gateware(tmp_path: Path) -> None:
