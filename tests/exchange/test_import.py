@@ -241,7 +241,10 @@ def test_lines_from_the_middle_of_a_run_have_its_code(
         (["both.npy", *SIZES, "--arm", "b"], "both.npy has two arms"),
         (["a.npy", *SIZES, "--columns-b", "0:8"], "or --arm b"),
         (["a.raw", *SIZES, "--dtype", "u16", "--pixels", 8, "--skip-bytes", -16], "0 or more"),
-        (["a.raw", *SIZES, "--dtype", "u16", "--pixels", 8, "--skip-bytes", 10**6], "cannot be skipped: a.raw has"),
+        (
+            ["a.raw", *SIZES, "--dtype", "u16", "--pixels", 8, "--skip-bytes", 10**6],
+            "cannot be skipped: a.raw has",
+        ),
         (["a.npy", *SIZES, "--start", "0001-01-01"], "1970 to 2099"),
         (["a.npy", *SIZES, "--start", "2300-01-01"], "1970 to 2099"),
         (["a.npy", *SIZES, "--first-line", 10**20], "possible: up to line "),
