@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 from acquire.config.variants import GROUP_KEY
 from acquire.plugins import GROUPS
-from acquire.text import shortened, shown
+from acquire.text import own_words, shortened, shown
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -25,7 +25,7 @@ def explained(error: ValidationError, model: type[BaseModel], path: Path | str) 
     for item in findings[:MOST_LISTED]:
         keys, allowed = _locate(model, item["loc"])
         key = shortened(".".join(keys)) or "(file)"
-        why = shortened(item["msg"].removeprefix("Value error, "), 400)
+        why = shortened(own_words(item["msg"]), 400)
         if item["type"] == "extra_forbidden":
             lines.append(f"  {key}: unknown key; allowed here: {', '.join(allowed) or 'none'}")
         elif item["type"] == "missing":
