@@ -243,9 +243,13 @@ def _plan(recording: Recording, selection: Selection, arguments: Arguments) -> R
 
 def _write_plan(path: Path, plan: ReconstructionPlan) -> None:
     """Write a plan as TOML, in which strings and numbers look the same as in JSON."""
+    from acquire.store.delivery import whole_file
+    from acquire.store.refusals import refused
+
     check_new_path(path)
     text = [f"{key} = {json.dumps(value)}" for key, value in plan.model_dump(exclude={"segments"}).items()]
     for part in plan.segments:
         text += ["", "[[segments]]"]
         text += [f"{key} = {json.dumps(value)}" for key, value in part.model_dump(exclude_none=True).items()]
-    path.write_text("\n".join(text) + "\n", encoding="utf-8")
+    with whole_file(path) as part, refused(path, "written"):
+        part.write_text("\n".join(text) + "\n", encoding="utf-8")
