@@ -31,7 +31,6 @@ _FORM = re.compile(r"\s*([0-9.eE+-]*[0-9.])\s*([a-zµ]*)\s*")
 _NS_PER_S = 1e9
 MOST_NS = 10**9 * UNITS_NS["s"]
 """Thirty years; a longer time is a typing error."""
-TOO_LONG = "is more than 30 years"
 
 
 def duration_ns(text: str) -> float | None:
@@ -52,7 +51,7 @@ def parse_duration_ns(text: str) -> int:
     if value is None:
         raise UsageError(f"the time {text!r} cannot be read", possible=MOMENTS)
     if value > MOST_NS:
-        raise UsageError(f"the time {text!r} {TOO_LONG}", possible=MOMENTS)
+        raise UsageError(f"the time {text!r} is more than 30 years", possible=MOMENTS)
     return round(value)
 
 
@@ -62,7 +61,7 @@ def seconds(text: str | float) -> float:
     if value is None:
         raise typer.BadParameter(f"{text!r} is not a duration, such as {DURATIONS}")
     if value > MOST_NS:
-        raise typer.BadParameter(f"{text!r} {TOO_LONG}")
+        raise typer.BadParameter(f"{text!r} is more than 30 years")
     return value / _NS_PER_S
 
 

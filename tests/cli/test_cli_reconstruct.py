@@ -249,7 +249,7 @@ def test_a_video_is_written_to_a_url_and_rendered_from_it(cli: Cli, recording: P
         (("--auto", "--nm", 3), "have no effect with --auto"),
         (("--preview", "--tm", 1), "have no effect with --preview"),
         (("--preview", "--iterations", 5), "--preset and --iterations have no effect with --preview"),
-        (("--voxels", "1x4", "--nm", 3), "--voxels excludes --nm and --tm"),
+        (("--voxels", "1x4", "--nm", 3), "--voxels and --nm or --tm exclude each other"),
         (("--dask", "tcp://127.0.0.1:9", "--workers", 2), "--workers has no effect with --dask"),
     ],
 )
