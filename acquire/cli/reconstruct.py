@@ -273,7 +273,9 @@ def _voxels(
     if spatial_merge is None and temporal_merge is None:
         return tuple(sizes or ())
     if sizes:
-        raise UsageError("--voxels and --nm or --tm exclude each other", possible="--voxels NMxTM alone, or --nm and --tm")
+        raise UsageError(
+            "--voxels and --nm or --tm exclude each other", possible="--voxels NMxTM, or --nm and --tm"
+        )
     return (
         f"{3 if spatial_merge is None else spatial_merge}x{1 if temporal_merge is None else temporal_merge}",
     )

@@ -37,8 +37,8 @@ RECORDED = {"recorded": True}
 MOST_TAGS_PER_S = 10_000
 """A free processor reads three times as many. To a host that lags behind, the trigger seems to be late."""
 MOST_URGENT_BLOCKS_PER_S = 2000
-"""Blocks per second and arm of grabbers in real time. The ring takes 27 us for a block, whatever its size, and
-a driver takes more; nothing else runs on that core meanwhile, not even the process that supervises it."""
+"""Blocks per second and arm of grabbers in real time. The ring takes 27 us for a block of any size, a driver
+takes more, and nothing else runs on that core meanwhile, not even the process that supervises it."""
 
 
 class GeometryConfig(FrozenModel):
