@@ -42,6 +42,8 @@ if TYPE_CHECKING:
 
     _Block = tuple[int, dict[str, Future[Readout]]]
 
+MOST_SIMULATED_LINES = 10**10
+"""Days of computing, and terabytes; more is a typing error."""
 _BLOCK_LINES = 1024
 _COMMIT_BLOCKS = 32
 STUDIED_LINES = 512
@@ -126,8 +128,10 @@ def simulate(
     Everything that can be refused is refused with a UsageError before ``path`` exists. A later failure or
     interruption leaves a sealed recording that states it.
     """
-    if lines < 1:
-        raise UsageError(f"a simulation of {lines} lines is not possible", possible="1 or more")
+    if not 1 <= lines <= MOST_SIMULATED_LINES:
+        raise UsageError(
+            f"a simulation of {lines} lines is not possible", possible=f"1 to {MOST_SIMULATED_LINES} lines"
+        )
     code, bench = config.code.build(), bench_of(config, scene)
     cameras = {arm: bench.camera(arm, code) for arm in ARMS}
     for camera in cameras.values():

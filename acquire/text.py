@@ -19,6 +19,7 @@ if TYPE_CHECKING:
 _ALLOWED = " \u00a0\u202f"
 """Spaces that typography needs; every other separator and control character is escaped."""
 _SUSPECT = re.compile(r"[^ -~]")
+_PREFIX = re.compile(r"(^|(?<=: ))Value error, ")
 
 
 def visible(text: object, *, lines: bool = False) -> str:
@@ -47,6 +48,11 @@ def did_you_mean(word: str, possible: Iterable[str]) -> str:
     """Return ``; did you mean 'start'?`` for a word close to a possible one, else an empty text."""
     near = difflib.get_close_matches(word, list(possible), n=1)
     return f"; did you mean {near[0]!r}?" if near else ""
+
+
+def own_words(message: str) -> str:
+    """Return pydantic's message about a value without the prefix that it puts before a validator's words."""
+    return _PREFIX.sub("", message, count=1)
 
 
 _REPR = reprlib.Repr()

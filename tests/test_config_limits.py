@@ -69,6 +69,17 @@ def test_a_block_that_takes_as_long_as_a_stall_is_refused() -> None:
     assert load_rig("rig-demo", settings | {"stream.stall_s": 4.0}).stream.block_lines == 500
 
 
+def test_tiny_blocks_in_real_time_are_refused() -> None:
+    settings = {"stream.realtime": True, "stream.block_lines": 4}
+    words = (
+        r"cannot be 4 with stream\.realtime: .* 8333 blocks/s .*; possible: 17 or more, or realtime = false"
+    )
+    with pytest.raises(ConfigError, match=words):
+        load_rig("rig-demo", settings)
+    assert load_rig("rig-demo", settings | {"stream.block_lines": 17}).stream.block_lines == 17
+    assert load_rig("rig-demo", {"stream.block_lines": 4}).stream.block_lines == 4
+
+
 def test_more_tags_than_the_host_can_read_are_refused() -> None:
     settings = {"trigger.substep_ticks": 900, "trigger.tag_every_lines": 3}
     fewest = r"cannot be 3 at 33333.3 lines/s; possible: 4 or more, since the host reads up to 10000 tags/s"

@@ -18,7 +18,7 @@ from acquire.sim.functions import FunctionSceneConfig
 from acquire.sim.leds import LedSceneConfig
 from acquire.sim.lines import StreamingArm
 from acquire.sim.scenes import build_scene
-from acquire.simulate import bench_of, simulate, study
+from acquire.simulate import MOST_SIMULATED_LINES, bench_of, simulate, study
 from acquire.store import open_recording
 
 RIG = load_rig("rig-demo", {"geometry.stages": 8, "recording.chunk_lines": 256})
@@ -88,6 +88,8 @@ def test_a_refusal_leaves_nothing_and_a_later_failure_a_sealed_recording(tmp_pat
     out = tmp_path / "r.zarr"
     with pytest.raises(UsageError, match="0 lines"):
         simulate(RIG, LEDS, out, 0)
+    with pytest.raises(UsageError, match="1 to 10000000000"):
+        simulate(RIG, LEDS, out, MOST_SIMULATED_LINES + 1)
     monkeypatch.syspath_prepend(str(tmp_path))
     (tmp_path / "turns_bad.py").write_text(
         "import numpy as np\n"

@@ -84,6 +84,8 @@ def snapshot(
 
     from acquire.camera.look import snapshot as take
     from acquire.camera.visit import visit
+    from acquire.store.delivery import whole_file
+    from acquire.store.refusals import refused
 
     path = out or Path(f"{serial}.png")
     _check_out(path)
@@ -92,12 +94,13 @@ def snapshot(
         pixels, flags = visit(
             bench.opener(serial), take, lines, seconds, timeout_s=2 * OPEN_S + seconds, armed=bench.pulse
         )
-    if path.suffix.lower() == ".npy":
-        np.save(path, pixels)
-    else:
-        low, span = int(pixels.min()), max(1, int(pixels.max()) - int(pixels.min()))
-        stretched = np.rint((pixels.astype(np.float32) - low) * (255 / span)).astype(np.uint8)
-        Image.fromarray(stretched).save(path)
+    with whole_file(path) as part, refused(path, "written"), part.open("wb") as file:
+        if path.suffix.lower() == ".npy":
+            np.save(file, pixels)
+        else:
+            low, span = int(pixels.min()), max(1, int(pixels.max()) - int(pixels.min()))
+            stretched = np.rint((pixels.astype(np.float32) - low) * (255 / span)).astype(np.uint8)
+            Image.fromarray(stretched).save(file, "PNG")
     facts = {
         "picture": str(path),
         "lines": len(pixels),

@@ -29,6 +29,8 @@ MOMENTS = (
 )
 _FORM = re.compile(r"\s*([0-9.eE+-]*[0-9.])\s*([a-zµ]*)\s*")
 _NS_PER_S = 1e9
+MOST_NS = 10**9 * UNITS_NS["s"]
+"""Thirty years; a longer time is a typing error."""
 
 
 def duration_ns(text: str) -> float | None:
@@ -48,6 +50,8 @@ def parse_duration_ns(text: str) -> int:
     value = duration_ns(text)
     if value is None:
         raise UsageError(f"the time {text!r} cannot be read", possible=MOMENTS)
+    if value > MOST_NS:
+        raise UsageError(f"the time {text!r} is more than 30 years", possible=MOMENTS)
     return round(value)
 
 
@@ -56,6 +60,8 @@ def seconds(text: str | float) -> float:
     value = duration_ns(str(text))
     if value is None:
         raise typer.BadParameter(f"{text!r} is not a duration, such as {DURATIONS}")
+    if value > MOST_NS:
+        raise typer.BadParameter(f"{text!r} is more than 30 years")
     return value / _NS_PER_S
 
 

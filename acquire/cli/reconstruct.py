@@ -50,11 +50,13 @@ def reconstruct(
     begin: FromOption = None,
     end: ToOption = None,
     spatial_merge: Annotated[
-        int, typer.Option("--spatial-merge", "--nm", help="N_m, side of a voxel in fine pixels.")
-    ] = 3,
+        int | None,
+        typer.Option("--spatial-merge", "--nm", help="N_m, side of a voxel in fine pixels. Default: 3."),
+    ] = None,
     temporal_merge: Annotated[
-        int, typer.Option("--temporal-merge", "--tm", help="T_m, number of sub-steps per frame.")
-    ] = 1,
+        int | None,
+        typer.Option("--temporal-merge", "--tm", help="T_m, number of sub-steps per frame. Default: 1."),
+    ] = None,
     voxels: Annotated[
         list[str] | None,
         typer.Option(
@@ -90,7 +92,7 @@ def reconstruct(
         str | None,
         typer.Option(
             help="Frames at the ends of the video: trusted (only those), or whole (also frames that are "
-            "sampled only in part)."
+            "sampled only in part). Default: trusted, or what the plan says."
         ),
     ] = None,
     preset: Annotated[
@@ -187,7 +189,7 @@ def reconstruct(
 
     # Everything that can be wrong is checked before the solver runs.
     began = time.monotonic() - _age_s()
-    _check_options(search, anything_wanted=bool(out or auto or explain))
+    _check_options(search, (workers, dask), anything_wanted=bool(out or auto or explain))
     solver_options = parse_settings(settings or ())
     open_solver(solver, solver_options)
     if denoiser is not None:
@@ -201,7 +203,7 @@ def reconstruct(
         lines=lines,
         begin=begin,
         end=end,
-        voxels=tuple(voxels or [f"{spatial_merge}x{temporal_merge}"]),
+        voxels=_voxels(voxels, spatial_merge, temporal_merge),
         plan=plan,
         segments=tuple(segment or ()),
         auto=auto,
@@ -223,7 +225,7 @@ def reconstruct(
         ),
         tiles=chosen_tiles,
     )
-    check_arguments(arguments)
+    check_arguments(arguments, explain=explain)
     places = [] if out is None else _new_places(out, suffixes(arguments))
     for doubt in () if chosen is None else chosen.doubts:
         print_warning(doubt)
@@ -247,7 +249,9 @@ def reconstruct(
         raise typer.Exit(EXIT_INTERRUPTED)
 
 
-def _check_options(search: str | None, *, anything_wanted: bool) -> None:
+def _check_options(
+    search: str | None, where: tuple[int | None, str | None], *, anything_wanted: bool
+) -> None:
     if not anything_wanted:
         raise UsageError(
             "reconstruct needs --out, the video to write",
@@ -255,6 +259,26 @@ def _check_options(search: str | None, *, anything_wanted: bool) -> None:
         )
     if search not in SEARCHES:
         raise UsageError(f"there is no --search {search}", possible="each, shared")
+    if None not in where:
+        raise UsageError(
+            "--workers has no effect with --dask, whose cluster has workers of its own",
+            possible="one of them",
+        )
+
+
+def _voxels(
+    sizes: list[str] | None, spatial_merge: int | None, temporal_merge: int | None
+) -> tuple[str, ...]:
+    """Return the voxel sizes that were asked for, in either way; none if there was no such option."""
+    if spatial_merge is None and temporal_merge is None:
+        return tuple(sizes or ())
+    if sizes:
+        raise UsageError(
+            "--voxels and --nm or --tm exclude each other", possible="--voxels NMxTM, or --nm and --tm"
+        )
+    return (
+        f"{3 if spatial_merge is None else spatial_merge}x{1 if temporal_merge is None else temporal_merge}",
+    )
 
 
 def _new_places(out: str, names: list[str]) -> list[str]:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 from acquire.cli.output import print_table, say
 from acquire.cli.progress import stage_progress
-from acquire.cli.reconstruct_request import parse_voxels, requested_lines
+from acquire.cli.reconstruct_request import requested_lines
 from acquire.errors import UsageError
 
 if TYPE_CHECKING:
@@ -33,7 +33,7 @@ def explain_calibration(
             possible="--calibration NAME.zarr",
             hint="acquire calibrate, to make one",
         )
-    voxels = parse_voxels(arguments.voxels[0])
+    voxels = arguments.kinds[0]
     first, lines = requested_lines(recording, arguments)
     stream = by_lines(recording, recording.first_available_line if first is None else first, lines).stream
     count = min(stream.end_line - stream.first_line, MOST_LINES)

@@ -34,6 +34,7 @@ if TYPE_CHECKING:
     from acquire.reconstruct import Options, VideoRequest
     from acquire.store import Recording
 
+USUAL_VOXELS = "3x1"
 PREVIEW_ITERATIONS = 8
 PREVIEW_BANDWIDTH = 0.5
 """Share of the frames' Nyquist frequency; a search for the best one would take longer than the preview."""
@@ -49,7 +50,7 @@ ENDS = {None: None, "trusted": False, "whole": True}
 
 @dataclass(frozen=True, slots=True)
 class Arguments:
-    """The arguments of the command, as given."""
+    """The arguments of the command, as given. ``voxels`` is empty if no size was given."""
 
     first_line: int | None
     lines: int | None
@@ -65,6 +66,11 @@ class Arguments:
     preset: str | None
     options: Options
     tiles: tuple[Tile, ...] = ()
+
+    @property
+    def kinds(self) -> list[Voxels]:
+        """The voxel sizes, each once."""
+        return list(dict.fromkeys(map(parse_voxels, self.voxels or (USUAL_VOXELS,))))
 
 
 @dataclass(frozen=True, slots=True)
@@ -104,13 +110,34 @@ def prepare(recording: Recording, arguments: Arguments) -> Prepared:
     return replace(prepared, options=options, learned=choice.why)
 
 
-def check_arguments(arguments: Arguments) -> None:
-    """Raise UsageError for arguments that contradict each other, and for a plan file that exists."""
+def check_arguments(arguments: Arguments, *, explain: bool = False) -> None:
+    """Raise UsageError for arguments that contradict each other, and for a plan file that exists.
+
+    With ``explain``, voxel sizes have a use beside a plan.
+    """
     if arguments.ends not in ENDS:
         raise UsageError(f"there is no --ends {arguments.ends}", possible="trusted, whole")
-    planned = (arguments.plan is not None) + bool(arguments.segments) + arguments.auto
-    if planned + arguments.preview > 1:
-        raise UsageError("--plan, --segment, --auto and --preview exclude each other", possible="one of them")
+    ways = {
+        "--plan": arguments.plan is not None,
+        "--segment": bool(arguments.segments),
+        "--auto": arguments.auto,
+        "--preview": arguments.preview,
+    }
+    chosen = [name for name, given in ways.items() if given]
+    if len(chosen) > 1:
+        raise UsageError(f"{', '.join(ways)} exclude each other", possible="one of them")
+    if chosen and arguments.voxels and not explain:
+        raise UsageError(
+            f"--voxels, --nm and --tm have no effect with {chosen[0]}, which has voxels of its own",
+            possible=f"{chosen[0]}, or voxel sizes",
+        )
+    if arguments.preview and (arguments.preset, arguments.options.iterations) != (None, None):
+        raise UsageError(
+            f"--preset and --iterations have no effect with --preview, which makes {PREVIEW_ITERATIONS} "
+            "iterations",
+            possible="a part of the lines with coarse voxels: --from, --to and --voxels 6x4 --preset fast",
+        )
+    planned = bool(chosen) and not arguments.preview
     if arguments.save_plan is not None:
         if not planned:
             raise UsageError(
@@ -121,8 +148,8 @@ def check_arguments(arguments: Arguments) -> None:
 
 def suffixes(arguments: Arguments) -> list[str]:
     """Return what distinguishes the name of each video: its voxel size, or nothing if there is one video."""
-    kinds = dict.fromkeys(map(parse_voxels, arguments.voxels))
     single = arguments.plan is not None or arguments.segments or arguments.auto or arguments.preview
+    kinds = arguments.kinds
     return [""] if single or len(kinds) == 1 else [str(kind) for kind in kinds]
 
 
@@ -142,8 +169,7 @@ def _requests(recording: Recording, arguments: Arguments) -> Prepared:
         if arguments.save_plan is not None:
             _write_plan(arguments.save_plan, plan)
         return Prepared({"": along_plan(selection, plan)}, arguments.options, plan)
-    kinds = dict.fromkeys(map(parse_voxels, arguments.voxels))
-    requests = [in_voxels(selection, kind, whole_ends=whole) for kind in kinds]
+    requests = [in_voxels(selection, kind, whole_ends=whole) for kind in arguments.kinds]
     return Prepared(dict(zip(suffixes(arguments), requests, strict=True)), arguments.options)
 
 
@@ -234,7 +260,8 @@ def _plan(recording: Recording, selection: Selection, arguments: Arguments) -> R
                 tiles=arguments.tiles,
             )
     if arguments.plan is not None:
-        return load_plan(arguments.plan)
+        plan = load_plan(arguments.plan)
+        return plan if arguments.ends is None else plan.model_copy(update={"ends": arguments.ends})
     if not arguments.segments:
         return None
     ends = {} if arguments.ends is None else {"ends": arguments.ends}
@@ -243,9 +270,13 @@ def _plan(recording: Recording, selection: Selection, arguments: Arguments) -> R
 
 def _write_plan(path: Path, plan: ReconstructionPlan) -> None:
     """Write a plan as TOML, in which strings and numbers look the same as in JSON."""
+    from acquire.store.delivery import whole_file
+    from acquire.store.refusals import refused
+
     check_new_path(path)
     text = [f"{key} = {json.dumps(value)}" for key, value in plan.model_dump(exclude={"segments"}).items()]
     for part in plan.segments:
         text += ["", "[[segments]]"]
         text += [f"{key} = {json.dumps(value)}" for key, value in part.model_dump(exclude_none=True).items()]
-    path.write_text("\n".join(text) + "\n", encoding="utf-8")
+    with whole_file(path) as file, refused(path, "written"):
+        file.write_text("\n".join(text) + "\n", encoding="utf-8")

@@ -52,7 +52,7 @@ def list_recordings(
     directory: Annotated[Path, typer.Argument(metavar="DIR", help="Directory to list.")] = Path(),
     json: JsonFlag = False,
 ) -> None:
-    """List the recordings in a directory. Damaged ones are marked; videos are not listed.
+    """List the recordings in a directory, or one recording. Damaged ones are marked; videos are not listed.
 
     Example: [bold]acquire ls /data[/]
     """
@@ -60,6 +60,8 @@ def list_recordings(
 
     with refused(directory, "listed", "a directory of recordings; `acquire info` describes one"):
         named = sorted(path for path in directory.iterdir() if path.name.endswith(".zarr"))
+        if (directory / "zarr.json").is_file():
+            named = [directory.absolute()]  # "." has no name to list
     found = [facts for path in named if (facts := _summary(path)) is not None]
     if json:
         print_json(found)
@@ -272,6 +274,8 @@ def _summary(path: Path) -> dict[str, Any] | None:
     from acquire.store.layout import DAMAGE
 
     try:
+        if path.is_symlink() and not path.exists():
+            return {"path": str(path), "error": f"{path}: a link to {path.readlink()}, which does not exist"}
         if not path.is_dir() or (format_of(path) or "").startswith("acquire-video/"):
             return None
     except (AcquireError, OSError):

@@ -34,6 +34,7 @@ LINES, FIRST_LINE = 263, 200
 APART = 67
 """Distance between two repeats, in lines."""
 LONGEST_S = 60.0
+MOST_LINES = 100_000
 
 
 def register(app: typer.Typer) -> None:
@@ -83,7 +84,9 @@ def tradeoff(
             help="Number of the first line to use. Default: chosen near the start of the recording."
         ),
     ] = None,
-    lines: Annotated[int, typer.Option(help="L_R, number of lines to reconstruct.")] = LINES,
+    lines: Annotated[
+        int, typer.Option(min=1, max=MOST_LINES, help="L_R, number of lines to reconstruct.")
+    ] = LINES,
     budget: Annotated[
         float,
         typer.Option(

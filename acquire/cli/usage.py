@@ -16,7 +16,7 @@ from acquire.cli.help import EXAMPLE, SUMMARY, make_plain, overview
 from acquire.cli.output import say
 from acquire.cli.words import VARIABLE
 from acquire.errors import EXIT_INTERRUPTED, UsageError
-from acquire.text import did_you_mean
+from acquire.text import did_you_mean, own_words
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
@@ -134,7 +134,8 @@ def _usage_error(error: Any) -> UsageError:
     context, near = getattr(error, "ctx", None), getattr(error, "possibilities", None)
     command = context.command_path if context is not None else "acquire"
     where = f"{command.removeprefix('acquire').lstrip()}: ".removeprefix(": ")
-    message = (error.message if near else error.format_message()).partition(" Did you mean")[0].rstrip(".")
+    message = own_words(error.message if near else error.format_message())
+    message = message.partition(" Did you mean")[0].rstrip(".")
     # click's messages have no verb in these two cases
     sentence = message[:1].lower() + message[1:]
     sentence = re.sub(r"^no such (option|command):? ", r"there is no \1 ", sentence)

@@ -92,6 +92,7 @@ def _settings(
     from acquire.config.web import WebConfig
     from acquire.errors import UsageError
     from acquire.place import default_socket
+    from acquire.text import own_words
 
     if given is not None:
         facts = json.loads(given)
@@ -104,6 +105,6 @@ def _settings(
         try:
             settings = type(settings).model_validate({**settings.model_dump(), **changes})
         except ValidationError as error:
-            raise UsageError(error.errors()[0]["msg"].removeprefix("Value error, ")) from error
+            raise UsageError(own_words(error.errors()[0]["msg"])) from error
     where = socket or (rig.control.socket if rig else default_socket())
     return where.absolute(), rig.recording.directory.absolute() if rig else None, settings

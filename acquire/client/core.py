@@ -30,7 +30,7 @@ from acquire.daemon.messages import (
 from acquire.daemon.who import HEADER, WHO
 from acquire.errors import AcquireError, UsageError
 from acquire.place import default_socket
-from acquire.text import shortened
+from acquire.text import own_words, shortened
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -169,7 +169,7 @@ def request(command: str, model: type[R], **fields: Any) -> R:
     except ValidationError as error:
         first = error.errors()[0]
         where = ".".join(map(str, first["loc"]))
-        why = first["msg"].removeprefix("Value error, ")
+        why = own_words(first["msg"])
         raise UsageError(shortened(f"{command}: {where} {why}".replace("  ", " "), 1000)) from error
 
 

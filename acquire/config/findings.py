@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 from acquire.config.variants import GROUP_KEY
 from acquire.plugins import GROUPS
-from acquire.text import shortened, shown
+from acquire.text import own_words, shortened, shown
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -20,12 +20,12 @@ MOST_LISTED = 20
 
 def explained(error: ValidationError, model: type[BaseModel], path: Path | str) -> str:
     """Return one line per finding, with its key, its value, the reason and what is allowed."""
-    lines = [f"{path}: {error.error_count()} error(s)"]
-    findings = error.errors()
+    findings = _without_consequences(error.errors())
+    lines = [f"{path}: {len(findings)} error(s)"]
     for item in findings[:MOST_LISTED]:
         keys, allowed = _locate(model, item["loc"])
         key = shortened(".".join(keys)) or "(file)"
-        why = shortened(item["msg"].removeprefix("Value error, "), 400)
+        why = shortened(own_words(item["msg"]), 400)
         if item["type"] == "extra_forbidden":
             lines.append(f"  {key}: unknown key; allowed here: {', '.join(allowed) or 'none'}")
         elif item["type"] == "missing":
@@ -37,6 +37,19 @@ def explained(error: ValidationError, model: type[BaseModel], path: Path | str) 
     if len(findings) > MOST_LISTED:
         lines.append(f"  and {len(findings) - MOST_LISTED} more")
     return "\n".join(lines)
+
+
+def _without_consequences(findings: list[Any]) -> list[Any]:
+    """Leave out that a list is too short, if only because pydantic did not count its invalid items."""
+    places = [item["loc"] for item in findings]
+    return [
+        item
+        for item in findings
+        if item["type"] != "too_short"
+        or not any(
+            len(place) > len(item["loc"]) and place[: len(item["loc"])] == item["loc"] for place in places
+        )
+    ]
 
 
 def _locate(model: type[BaseModel], location: tuple[int | str, ...]) -> tuple[list[str], list[str]]:

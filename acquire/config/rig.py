@@ -36,6 +36,9 @@ RECORDED = {"recorded": True}
 """Context in which the rig of a recording is validated: limits of the capture path do not apply to it."""
 MOST_TAGS_PER_S = 10_000
 """A free processor reads three times as many. To a host that lags behind, the trigger seems to be late."""
+MOST_URGENT_BLOCKS_PER_S = 2000
+"""Blocks per second and arm of grabbers in real time. The ring takes 27 us for a block of any size, a driver
+takes more, and nothing else runs on that core meanwhile, not even the process that supervises it."""
 
 
 class GeometryConfig(FrozenModel):
@@ -232,6 +235,21 @@ class RigConfig(FrozenModel):
                 f"stream.block_lines cannot be {self.stream.block_lines}: at {passing_hz:g} lines/s such a "
                 f"block takes {block_s:.3g} s; possible: up to {math.floor(passing_hz * most_s)}, half the "
                 "time after which an arm counts as stalled (stream.stall_s, stream.reopen_s)"
+            )
+        return self
+
+    @model_validator(mode="after")
+    def _grabbers_leave_time(self, info: ValidationInfo) -> RigConfig:
+        """Grabbers that run ahead of everything else must not take all of the processor's time."""
+        if _is_recorded(info) or not self.stream.realtime:
+            return self
+        passing_hz = self.line_rate_hz * self.simulation.speed
+        fewest = math.ceil(passing_hz / MOST_URGENT_BLOCKS_PER_S)
+        if self.stream.block_lines < fewest:
+            raise ValueError(
+                f"stream.block_lines cannot be {self.stream.block_lines} with stream.realtime: at "
+                f"{passing_hz:g} lines/s, {passing_hz / self.stream.block_lines:.0f} blocks/s would keep "
+                f"everything else from running; possible: {fewest} or more, or realtime = false"
             )
         return self
 

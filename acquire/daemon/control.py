@@ -18,7 +18,7 @@ from acquire.daemon.answers import Answers
 from acquire.daemon.messages import HTTP_STATUS, ErrorMessage, error_body, http_status
 from acquire.daemon.routes import routes
 from acquire.errors import AcquireError, UsageError
-from acquire.text import shortened, shown
+from acquire.text import own_words, shortened, shown
 
 if TYPE_CHECKING:
     from starlette.types import ASGIApp, Message, Receive, Scope, Send
@@ -96,7 +96,8 @@ def _add_errors(app: FastAPI) -> None:
         for item in found[:MOST_EXPLAINED]:
             # Everything here comes from the client, so it is shortened.
             key = ".".join(str(part) for part in item["loc"] if part != "body") or "request"
-            explained.append(f"{shortened(key)} = {shown(item.get('input'))}: {shortened(item['msg'], 400)}")
+            why = shortened(own_words(item["msg"]), 400)
+            explained.append(f"{shortened(key)} = {shown(item.get('input'))}: {why}")
         more = [f"and {len(found) - MOST_EXPLAINED} more"] if len(found) > MOST_EXPLAINED else []
         return _answer(UsageError("; ".join(explained + more), possible="/openapi.json"))
 

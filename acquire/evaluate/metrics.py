@@ -31,8 +31,8 @@ def psnr(video: NDArray[Any], truth: NDArray[Any], peak: float | None = None) ->
     positive, NumericsError for values that are not finite.
     """
     video, truth = check_pair(video, truth)
-    error = _mean_squared_error(video, truth)
-    return float(_decibel(np.array([error]), checked_peak(truth, peak))[0])
+    error = _mean_squared_error(video, truth, checked_peak(truth, peak))
+    return float(_decibel(np.array([error]))[0])
 
 
 def psnr_per_frame(
@@ -40,9 +40,8 @@ def psnr_per_frame(
 ) -> NDArray[np.float64]:
     """Return the PSNR of each frame (t,) in dB, all with the same peak; raises as :func:`psnr`."""
     video, truth = check_pair(video, truth)
-    pairs = zip(video, truth, strict=True)
-    errors = np.array([_mean_squared_error(frame, true_frame) for frame, true_frame in pairs])
-    return _decibel(errors, checked_peak(truth, peak))
+    pairs, peak = zip(video, truth, strict=True), checked_peak(truth, peak)
+    return _decibel(np.array([_mean_squared_error(frame, true_frame, peak) for frame, true_frame in pairs]))
 
 
 def ssim(video: NDArray[Any], truth: NDArray[Any], data_range: float | None = None) -> float:
@@ -101,13 +100,14 @@ def checked_peak(truth: NDArray[Any], peak: float | None = None) -> float:
     return value
 
 
-def _mean_squared_error(video: NDArray[Any], truth: NDArray[Any]) -> float:
-    return float(np.mean(np.square(np.subtract(video, truth, dtype=np.float64))))
+def _mean_squared_error(video: NDArray[Any], truth: NDArray[Any], peak: float) -> float:
+    """Return the error in units of the peak, whose square may be too large or too small for a number."""
+    return float(np.mean(np.square(np.subtract(video, truth, dtype=np.float64) / peak)))
 
 
-def _decibel(errors: NDArray[np.float64], peak: float) -> NDArray[np.float64]:
+def _decibel(errors: NDArray[np.float64]) -> NDArray[np.float64]:
     with np.errstate(divide="ignore"):  # equal arrays give inf
-        decibel: NDArray[np.float64] = -10 * np.log10(errors / peak**2)
+        decibel: NDArray[np.float64] = -10 * np.log10(errors)
     return decibel
 
 
@@ -118,8 +118,8 @@ def _local_mean(image: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _ssim_frame(video: NDArray[Any], truth: NDArray[Any], data_range: float) -> float:
-    x, y = video.astype(np.float64), truth.astype(np.float64)
-    c1, c2 = (SSIM_K1 * data_range) ** 2, (SSIM_K2 * data_range) ** 2
+    x, y = video.astype(np.float64) / data_range, truth.astype(np.float64) / data_range
+    c1, c2 = SSIM_K1**2, SSIM_K2**2
     mx, my = _local_mean(x), _local_mean(y)
     var_x, var_y = _local_mean(x * x) - mx * mx, _local_mean(y * y) - my * my
     cov = _local_mean(x * y) - mx * my

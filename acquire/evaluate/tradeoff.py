@@ -15,6 +15,7 @@ import numpy as np
 
 from acquire.config import load_recorded
 from acquire.config.scene import SineDrive
+from acquire.errors import UsageError
 from acquire.evaluate.curves import compare_curve, region_mean
 from acquire.evaluate.metrics import psnr, ssim
 from acquire.forward import merge_video
@@ -137,6 +138,17 @@ class Judge:
             self._truths[voxels] = whole[self.frames(voxels)]
         return self._truths[voxels]
 
+    def check(self, voxels: Voxels) -> None:
+        """Raise UsageError if the truth is dark, which no accuracy can be relative to."""
+        true = self.truth(voxels)
+        if true is not None and not true.max() > 0:
+            first, lines = self.segment.first_line, self.segment.geometry.lines
+            raise UsageError(
+                f"the scene is dark in the frames of lines {first} to {first + lines - 1}, which leaves no "
+                "accuracy to measure",
+                possible="--first-line and --lines of a range with light",
+            )
+
     def judged(self, point: Point, video: NDArray[Any], voxels: Voxels) -> Point:
         """Return ``point`` with the accuracy of its video."""
         shown, true = video[self.frames(voxels)], self.truth(voxels)
@@ -211,8 +223,9 @@ def measure(
 ) -> Run:
     """Reconstruct once and observe intermediate results, with the time so far but without that of observing.
 
-    The run is cut after ``longest_s``.
+    The run is cut after ``longest_s``. Raises UsageError for a dark scene.
     """
+    judge.check(voxels)
     points: list[Point] = []
 
     def look(now: Look) -> None:

@@ -286,9 +286,14 @@ def _raw(path: Path, layout: Layout, _: ExitStack) -> LineFile:
             f"{path} is raw binary, which needs a sample type and the pixels per line",
             hint="--dtype and --pixels",
         )
-    dtype, pixels = np.dtype(layout.dtype), layout.pixels
-    size, line_bytes = path.stat().st_size - layout.skip_bytes, dtype.itemsize * pixels
-    if pixels < 1 or layout.skip_bytes < 0 or size < line_bytes:
+    dtype, pixels, there = np.dtype(layout.dtype), layout.pixels, path.stat().st_size
+    if not 0 <= layout.skip_bytes <= there:
+        raise UsageError(
+            f"{layout.skip_bytes} bytes cannot be skipped: {path} has {there} bytes",
+            possible="0 or more, and fewer than the file has",
+        )
+    size, line_bytes = there - layout.skip_bytes, dtype.itemsize * pixels
+    if pixels < 1 or size < line_bytes:
         raise UsageError(f"{path} has {size} bytes of pixels", possible=f"{line_bytes} bytes for every line")
     if size % line_bytes:
         raise UsageError(

@@ -5,6 +5,7 @@ All three take tasks by `submit` and return futures; the caller keeps at most ``
 
 from __future__ import annotations
 
+import asyncio
 import multiprocessing
 import signal
 import threading
@@ -183,12 +184,20 @@ def open_pool(
 @contextmanager
 def _cluster(address: str) -> Iterator[Cluster]:
     try:
-        from distributed import Client
+        from distributed import Client, Security
+        from distributed.comm.core import connect
     except ModuleNotFoundError as error:
         raise UsageError(
             "--dask needs dask.distributed, which is not installed", hint="pip install 'tdi-acquire[dask]'"
         ) from error
+
+    async def knock() -> None:
+        secrets = Security().get_connection_args("client")  # type: ignore[no-untyped-call]
+        (await connect(address, timeout=SCHEDULER_TIMEOUT_S, **secrets)).abort()  # type: ignore[no-untyped-call]
+
     try:
+        # A Client that cannot connect is left half made, and its end waits for 20 s and prints a traceback.
+        asyncio.run(knock())
         client = Client(  # type: ignore[no-untyped-call]
             address, timeout=SCHEDULER_TIMEOUT_S, set_as_default=False
         )

@@ -37,7 +37,7 @@ class SideBySide:
         self._opener = opener
         self._parts: list[SimulatedCamera] = [part() for part in opener.openers]
         self._waiting: list[CameraBlock | None] = [None] * len(self._parts)
-        self._end = self._delivered = 0
+        self._delivered = 0
 
     def identify(self) -> CameraIdentity:
         return self._parts[0].identify()
@@ -47,7 +47,7 @@ class SideBySide:
 
     def arm(self) -> None:
         self._waiting = [None] * len(self._parts)
-        self._end = self._delivered = 0
+        self._delivered = 0
         first, *others = self._parts
         first.arm()
         for part in others:
@@ -74,7 +74,7 @@ class SideBySide:
 
     def _joined(self, blocks: list[CameraBlock], first_line: int, count: int) -> CameraBlock:
         """Return lines that are in all blocks side by side."""
-        self._delivered, self._end = self._delivered + count, first_line + count
+        self._delivered += count
         pixels: NDArray[Any] = np.zeros((count, self._opener.width), blocks[0].pixels.dtype)
         flags = np.zeros(count, np.uint16)
         for column, block in zip(self._opener.first_columns, blocks, strict=True):
@@ -95,7 +95,12 @@ class SideBySide:
 
     def statistics(self) -> dict[str, int]:
         behind = max(part.statistics()["behind_lines"] for part in self._parts)
-        return {"lines": self._delivered, "lost": self._end - self._delivered, "behind_lines": behind}
+        # A line that one part has passed, and holds no more, was delivered or cannot be.
+        passed = max(
+            part.passed if block is None else block.first_line
+            for part, block in zip(self._parts, self._waiting, strict=True)
+        )
+        return {"lines": self._delivered, "lost": passed - self._delivered, "behind_lines": behind}
 
     def close(self) -> None:
         for part in self._parts:

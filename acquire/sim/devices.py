@@ -192,6 +192,11 @@ class SimulatedCamera:
     def close(self) -> None:
         self.disarm()
 
+    @property
+    def passed(self) -> int:
+        """The line before which all were handed out or lost, since arming."""
+        return self._ready[0].first_line if self._ready else self._delivered
+
     def _behind(self, reading: Reading) -> int:
         """Return the lines due but not delivered. Raises CameraError once another train has started."""
         assert self._train is not None

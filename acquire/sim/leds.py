@@ -32,7 +32,7 @@ class LedConfig(FrozenModel):
     drive: DriveConfig
     saturation: float | None = Field(
         default=None,
-        gt=0,
+        ge=1e-6,
         description="drive at which the LED reaches 1 − 1/e of its asymptote; absent: linear",
     )
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 import subprocess
@@ -85,6 +86,20 @@ def test_a_snapshot_is_what_the_camera_sees(cli: Cli, tmp_path: Path, rig: str) 
         light = StreamingArm(made.scene(), config.code.build(), 64, 3, "b").lines(-depth, 300)
     np.testing.assert_allclose(pixels, 6.0 * light.astype(np.float64), rtol=0, atol=0.5 + 1e-3)  # rounding
     assert (facts["lines"], facts["pixels"], facts["flagged_lines"]) == (300, 64, 0)
+
+
+@pytest.mark.parametrize("suffix", [".npy", ".png"])
+def test_a_snapshot_that_the_disk_refuses_leaves_nothing(
+    cli: Cli, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, suffix: str
+) -> None:
+    def full(*_: Any, **__: Any) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(os, "fsync", full)
+    out = tmp_path / f"a{suffix}"
+    answer = cli("camera", "snapshot", "SIM-A", "-c", "rig-demo", "--lines", 200, "--out", out)
+    assert (answer.code, list(tmp_path.iterdir())) == (5, [])
+    assert "No space left" in answer.err
 
 
 def test_a_picture_is_stretched(cli: Cli, tmp_path: Path) -> None:

@@ -138,6 +138,18 @@ def test_a_plan_on_the_command_line(cli: Cli, recording: Path, tmp_path: Path) -
     assert open_video(tmp_path / "v.zarr").attrs["provenance"]["segments"][1]["spatial_merge"] == 1
 
 
+def test_the_ends_of_a_plan_file_are_overridden(cli: Cli, recording: Path, tmp_path: Path) -> None:
+    (tmp_path / "plan.toml").write_text("[[segments]]\nspatial_merge = 2\ntemporal_merge = 8\n")
+    words = ("--plan", tmp_path / "plan.toml", "--lines", 60, "--iterations", 2, "--json")
+    shapes = [
+        cli("reconstruct", recording, "--out", tmp_path / f"{ends}.zarr", "--ends", ends, *words).json[
+            "shape"
+        ]
+        for ends in ("trusted", "whole")
+    ]
+    assert shapes[0][0] < shapes[1][0]
+
+
 def test_a_proposed_plan_is_written_and_read_again(cli: Cli, recording: Path, tmp_path: Path) -> None:
     answer = cli("reconstruct", recording, "--auto", "--lines", 150, "--save-plan", tmp_path / "plan.toml")
     assert answer.code == 0, answer.err
@@ -224,6 +236,7 @@ def test_a_video_is_written_to_a_url_and_rendered_from_it(cli: Cli, recording: P
         (("--voxels", "3"), "NMxTM"),
         (("--lines", 50, "--to", "1ms"), "--from and --to"),
         (("--segment", ":2x2", "--segment", "5:2x2"), "only the last segment"),
+        (("--segment", "0:6x20"), "--segment: 1 error(s)\n  segments.0.lines = 0"),
         (("--plan", "nothing.toml"), "does not exist"),
         (("--ends", "half"), "trusted, whole"),
         (("--lines", 5), "more than 12 lines"),
@@ -232,6 +245,12 @@ def test_a_video_is_written_to_a_url_and_rendered_from_it(cli: Cli, recording: P
         (("--workers", 0), "1 or more"),
         (("--dtype", "float16"), "float32, float64"),
         (("--device", "tpu"), "cpu, gpu"),
+        (("--segment", ":2x2", "--voxels", "1x4"), "--voxels, --nm and --tm have no effect with --segment"),
+        (("--auto", "--nm", 3), "have no effect with --auto"),
+        (("--preview", "--tm", 1), "have no effect with --preview"),
+        (("--preview", "--iterations", 5), "--preset and --iterations have no effect with --preview"),
+        (("--voxels", "1x4", "--nm", 3), "--voxels and --nm or --tm exclude each other"),
+        (("--dask", "tcp://127.0.0.1:9", "--workers", 2), "--workers has no effect with --dask"),
     ],
 )
 def test_impossible_requests_are_refused(
@@ -324,13 +343,15 @@ def cluster(tmp_path: Path) -> Iterator[str]:
 
 
 @pytest.mark.needs_dask
-def test_an_unreachable_cluster(recording: Path, tmp_path: Path) -> None:
-    words = ["reconstruct", str(recording), "--out", str(tmp_path / "v.zarr"), "--dask", "tcp://127.0.0.1:9"]
+@pytest.mark.parametrize("address", ["tcp://127.0.0.1:9", "foo"])
+def test_an_unreachable_cluster(recording: Path, tmp_path: Path, address: str) -> None:
+    words = ["reconstruct", str(recording), "--out", str(tmp_path / "v.zarr"), "--dask", address]
     ended = subprocess.run(
         [sys.executable, "-m", "acquire", *words], capture_output=True, text=True, timeout=300, check=False
     )
     assert ended.returncode == 2
-    assert "no Dask scheduler answers on tcp://127.0.0.1:9" in ended.stderr
+    assert f"no Dask scheduler answers on {address}" in ended.stderr
+    assert ended.stderr.splitlines()[-1].startswith("  possible:"), ended.stderr
 
 
 @pytest.mark.needs_dask
@@ -343,8 +364,6 @@ def test_a_cluster_gives_the_same_result_as_this_machine(
         "acquire",
         "reconstruct",
         str(recording),
-        "--nm",
-        "2",
         "--iterations",
         "8",
     ]

@@ -138,6 +138,16 @@ def test_ls_leaves_videos_out(cli: Cli, recording: Path) -> None:
     assert [Path(item["path"]).name for item in cli("ls", recording.parent, "--json").json] == ["one.zarr"]
 
 
+def test_ls_of_a_link_to_nowhere_and_of_a_recording_itself(cli: Cli, recording: Path) -> None:
+    (recording.parent / "away.zarr").symlink_to("/nowhere/away.zarr")
+    away, good = cli("ls", recording.parent, "--json").json
+    assert "a link to /nowhere/away.zarr, which does not exist" in away["error"]
+    assert cli("ls", recording, "--json").json == [good]
+    (recording / "zarr.json").write_text("{")
+    (damaged,) = cli("ls", recording, "--json").json
+    assert "damaged" in damaged["error"]
+
+
 def test_ls_of_nothing(cli: Cli, tmp_path: Path) -> None:
     assert cli("ls", tmp_path).out == f"there are no recordings in {tmp_path}\n"
     assert cli("ls", tmp_path, "--json").json == []

@@ -75,6 +75,7 @@ def test_help_fits_a_narrow_terminal_and_cuts_no_name(
         (("start", "--line", "5"), "acquire start", "start: there is no option --line"),
         (("cut",), "acquire cut", "cut: the argument 'RECORDING' is missing"),
         (("start", "--lines", "x"), "acquire start", "start: invalid value for '--lines'"),
+        (("demo", "--trigger", "x"), "acquire demo", "demo: invalid value for '--trigger': 'x' is not one"),
         (("trigger", "lod"), "acquire trigger", "trigger: there is no command 'lod'"),
     ],
 )

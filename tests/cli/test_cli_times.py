@@ -58,6 +58,14 @@ def test_an_invalid_duration_is_refused_with_valid_ones(text: str) -> None:
         seconds(text)
 
 
+@pytest.mark.parametrize("text", ["1e200s", "350640h", "1e10"])
+def test_an_absurd_duration_is_refused(text: str) -> None:
+    with pytest.raises(UsageError, match="more than 30 years"):
+        parse_duration_ns(text)
+    with pytest.raises(typer.BadParameter, match="more than 30 years"):
+        seconds(text)
+
+
 def test_limits_of_a_duration_are_named() -> None:
     assert seconds_between(0.1, 60)("2s") == 2
     with pytest.raises(typer.BadParameter, match=r"0\.1 to 60 s"):

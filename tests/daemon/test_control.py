@@ -76,6 +76,10 @@ def test_malformed_request_names_the_key(path: Path, daemon: Client) -> None:
         message = ErrorMessage.model_validate_json(answer.content)
         assert message.error == "UsageError"
         assert message.message.startswith("line = 5")
+        both = ErrorMessage.model_validate_json(
+            raw.post("/start", json={"lines": 1, "duration_s": 1}).content
+        )
+        assert both.message.endswith(": lines and duration_s exclude each other: give one")
         described = raw.get("/openapi.json").json()
     assert {"/status", "/arm", "/start", "/mark", "/stop", "/disarm"} < set(described["paths"])
     assert "Status" in described["components"]["schemas"]

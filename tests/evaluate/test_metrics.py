@@ -30,6 +30,13 @@ def test_peak_is_the_truths_maximum_unless_given() -> None:
     assert psnr(video, truth, 2 * truth.max()) == pytest.approx(psnr(video, truth) + 20 * math.log10(2))
 
 
+@pytest.mark.parametrize("scale", [1e-200, 1e200])
+def test_the_unit_of_light_makes_no_difference(scale: float) -> None:
+    video, truth = random_pair(2, (2, 12, 12))
+    assert psnr(scale * video, scale * truth) == pytest.approx(psnr(video, truth))
+    assert ssim(scale * video, scale * truth) == pytest.approx(ssim(video, truth))
+
+
 def test_equal_videos_are_infinitely_good() -> None:
     _, truth = random_pair(1, (2, 12, 12))
     assert psnr(truth, truth) == math.inf

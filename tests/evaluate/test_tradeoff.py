@@ -75,6 +75,13 @@ def test_a_real_recording_has_no_truth(judge):
     assert blind.end.frame is not None
 
 
+def test_a_dark_segment_is_refused_before_it_is_reconstructed(judge, monkeypatch):
+    monkeypatch.setattr("acquire.evaluate.tradeoff.reconstruct", None)
+    dark = Judge(judge.segment, None, np.zeros(judge.segment.geometry.video_shape(1, 1), np.float32))
+    with pytest.raises(UsageError, match="dark in the frames of lines 20 to 139"):
+        measure(dark, "admm", VOXELS)
+
+
 def test_the_truth_of_the_baseline_is_in_its_own_pixels_and_sub_steps(tmp_path):
     rig = load_rig("rig-interline", {"geometry.stages": 12})
     simulate(rig, load_scene("scene-usaf-interline"), tmp_path / "r.zarr", 100)

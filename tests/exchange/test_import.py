@@ -267,6 +267,10 @@ def test_a_thumbnail_beside_the_lines_of_a_tiff_file_does_no_harm(tmp_path: Path
         (["both.npy", *SIZES, "--arm", "b"], "both.npy has two arms"),
         (["a.npy", *SIZES, "--columns-b", "0:8"], "or --arm b"),
         (["a.raw", *SIZES, "--dtype", "u16", "--pixels", 8, "--skip-bytes", -16], "0 or more"),
+        (
+            ["a.raw", *SIZES, "--dtype", "u16", "--pixels", 8, "--skip-bytes", 10**6],
+            "cannot be skipped: a.raw has",
+        ),
         (["a.npy", *SIZES, "--start", "0001-01-01"], "1970 to 2099"),
         (["a.npy", *SIZES, "--start", "2300-01-01"], "1970 to 2099"),
         (["a.npy", *SIZES, "--first-line", 10**20], "possible: up to line "),

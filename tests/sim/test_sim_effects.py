@@ -9,6 +9,7 @@ from math import comb
 import numpy as np
 import pytest
 from effect_cases import FLAT, PARAMETERS, effects, electrons, setting, through
+from pydantic import ValidationError
 from sim_helpers import CODE
 from small_bench import DT, LIT, K, N, S, bench, blinking, flat, read
 
@@ -85,6 +86,19 @@ def test_arms_seeds_and_realisations_draw_differently_and_patterns_stay():
     for other in others:
         assert abs(np.corrcoef(a.ravel(), other.ravel())[0, 1]) < 0.03
     assert np.ptp(electrons(fixed), axis=0).max() == 0
+
+
+@pytest.mark.parametrize("value", [1e-310, 1e-200, 1e200])
+@pytest.mark.parametrize(
+    ("kind", "key"),
+    [(kind, key) for kind in PARAMETERS for key, value in PARAMETERS[kind].items() if type(value) is float],
+)
+def test_absurd_numbers_are_refused_or_harmless(kind, key, value):
+    try:
+        scene = blinking(effects(kind, **{key: value}))
+    except ValidationError:
+        return
+    read(scene, 8, CODE)
 
 
 def test_effects_act_in_the_order_of_physics_whatever_the_list_says():

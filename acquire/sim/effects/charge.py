@@ -56,7 +56,7 @@ class DarkCurrent(Effect):
     kind: Literal["dark_current"]
     place: ClassVar[Place] = "charge"
     rank: ClassVar[float] = 30
-    electrons_per_s: Positive = Field(description="μ_I per pixel")
+    electrons_per_s: Positive = Field(le=1e12, description="μ_I per pixel")
 
     def stages(self, setting: Setting) -> list[Stage]:
         """+ Poisson(μ_I·t_exp), with t_exp of M line periods (EMVA 1288 Eq. 17)."""

@@ -6,17 +6,21 @@ frame by frame.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, ClassVar, Literal
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 import numpy as np
 from pydantic import Field
 
 from acquire.alignment import Alignment
-from acquire.config.base import Part, Positive
+from acquire.config.base import Part
 from acquire.sim.effects.base import Effect, Place, Setting, Stage
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
+
+
+Blur = Annotated[float, Field(ge=0.01, le=1024)]
+"""From no pixel of blur at all to the width of the largest scenes."""
 
 
 class Misregistration(Effect):
@@ -66,8 +70,8 @@ class PointSpread(Effect):
     kind: Literal["psf"]
     place: ClassVar[Place] = "image"
     rank: ClassVar[float] = 40
-    sigma_pixels: Positive = Field(description="standard deviation in fine pixels")
-    sigma_b_pixels: Positive | None = Field(default=None, description="for arm B; absent: sigma_pixels")
+    sigma_pixels: Blur = Field(description="standard deviation in fine pixels")
+    sigma_b_pixels: Blur | None = Field(default=None, description="for arm B; absent: sigma_pixels")
 
     def stages(self, setting: Setting) -> list[Stage]:
         """Convolve with a normalised Gaussian of σ fine pixels, cut off at 4σ; light may leave the field."""
@@ -91,7 +95,9 @@ class StrayLight(Effect):
     place: ClassVar[Place] = "image"
     rank: ClassVar[float] = 50
     veil: Part = Field(default=0.0, description="fraction of the scene's light that is spread evenly")
-    ambient: float = Field(default=0.0, ge=0, description="ambient light in units of the scene's light")
+    ambient: float = Field(
+        default=0.0, ge=0, le=1e6, description="ambient light in units of the scene's light"
+    )
 
     def stages(self, setting: Setting) -> list[Stage]:
         """Veil v: X ← (1 − v)·X + v·mean(X). Ambient light a: Y ← Y + a·n·S², in every line, coded or not.

@@ -63,7 +63,7 @@ class Pwm(Effect):
     kind: Literal["pwm"]
     place: ClassVar[Place] = "light"
     rank: ClassVar[float] = 20
-    carrier_hz: Positive
+    carrier_hz: float = Field(ge=1, le=1e9)
     bits: int = Field(default=8, ge=1, le=16, description="resolution of the duty cycle")
 
     def stages(self, setting: Setting) -> list[Stage]:
@@ -102,7 +102,7 @@ class LedNonlinearity(Effect):
     kind: Literal["led_nonlinearity"]
     place: ClassVar[Place] = "light"
     rank: ClassVar[float] = 30
-    saturation: Positive = Field(description="a, in units of full drive")
+    saturation: float = Field(ge=1e-6, description="a, in units of full drive")
 
     def stages(self, setting: Setting) -> list[Stage]:  # noqa: ARG002
         """d → a·(1 − exp(−d/a)): slope 1 for small drives, never more than a (near saturation: Fig. 9c)."""
@@ -116,8 +116,8 @@ class LedRiseFall(Effect):
     kind: Literal["led_rise_fall"]
     place: ClassVar[Place] = "light"
     rank: ClassVar[float] = 40
-    rise_s: Positive
-    fall_s: Positive
+    rise_s: Positive = Field(le=0.1)
+    fall_s: Positive = Field(le=0.1)
 
     def stages(self, setting: Setting) -> list[Stage]:
         """dL/dt = (d − L)/τ with τ = rise if L < d, else fall; a sub-step gets the exact mean of L."""
