@@ -17,13 +17,13 @@ import numpy as np
 from acquire.cores import limit_threads
 from acquire.evaluate.metrics import psnr
 from acquire.recon import reconstruct
-from acquire.sim.procedural import CLEAN, SCENES, TOP_DN, Camera, record
+from acquire.sim.procedural import CLEAN, SCENES, Camera, record
 from tools.results import add_option, recorded
 
 if TYPE_CHECKING:
     from acquire.lines import Segment
 
-VOXEL = 3
+VOXEL, FULL_SCALE_DN = 3, 4095
 CHANGED = 0.005
 """Share of the samples that are one DN more or less in another version."""
 
@@ -35,7 +35,7 @@ def version(segment: Segment, number: int) -> Segment:
     rng = np.random.default_rng(number)
     changed = rng.random(segment.lines.shape) < CHANGED
     lines = segment.lines + changed * rng.choice((-1, 1), segment.lines.shape)
-    return replace(segment, lines=lines.clip(0, TOP_DN).astype(segment.lines.dtype))
+    return replace(segment, lines=lines.clip(0, FULL_SCALE_DN).astype(segment.lines.dtype))
 
 
 def main() -> None:
