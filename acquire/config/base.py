@@ -33,6 +33,7 @@ class FrozenModel(BaseModel):
         """Turn a file's lists, and the lists in them, into tuples, since the model is immutable."""
         if not isinstance(table, dict):
             return table
+        # A strict model takes no list for a tuple, and TOML has only lists.
         return {key: _tuples(value) if isinstance(value, list) else value for key, value in table.items()}
 
 

@@ -19,6 +19,7 @@ GentlModule = Literal["remote", "interface", "device", "stream", "system"]
 """The module that has a feature: the camera itself ("remote"), or a module on the host's side."""
 
 
+# Limits such as 2**24 and 255 are the widths of the trigger's registers.
 class LineOutputConfig(FrozenModel):
     """The line trigger of one camera, in ticks of the trigger's clock."""
 
@@ -119,6 +120,7 @@ class TriggerConfig(FrozenModel):
         if not isinstance(table, dict) or "watchdog_ticks" not in table or "watchdog_s" in table:
             return table
         ticks, clock_hz = table["watchdog_ticks"], table.get("clock_hz", cls.model_fields["clock_hz"].default)
+        # Left as it is: validation refuses it, with the key in its message.
         if not isinstance(ticks, int) or not isinstance(clock_hz, int) or clock_hz <= 0:
             return table
         return {k: v for k, v in table.items() if k != "watchdog_ticks"} | {"watchdog_s": ticks / clock_hz}
@@ -154,6 +156,7 @@ class CameraConfig(FrozenModel):
         description="[module, feature, value] in the order in which they are written; 'aravis': module "
         "'stream' has frame-retention, packet-timeout, packet-resend and other parameters of its stream",
     )
+    # Not less: buffers for 10 ms were overrun on a loaded host.
     buffer_s: float = Field(
         default=0.5, ge=0.2, le=60, description="lines that the driver can buffer, in seconds"
     )
@@ -233,6 +236,7 @@ class CamerasConfig(FrozenModel):
         if (
             self.layout != "compact"
             and self.a.serial == self.b.serial
+            # Simulated cameras are not found by their serial, which is the same by default.
             and (self.a.driver, self.b.driver) != ("simulated", "simulated")
         ):
             raise ValueError(f"both arms have the camera with serial {self.a.serial!r}")

@@ -189,6 +189,7 @@ def _check_kind(table: dict[str, Any], wanted: str, path: Path) -> None:
 def _set(table: dict[str, Any], dotted: str, value: Any) -> None:
     *parents, last = dotted.split(".")
     for key in parents:
+        # A setting may belong to a table that the file leaves out.
         table = table.setdefault(key, {})
         if not isinstance(table, dict):
             raise ConfigError(f"setting {dotted!r} cannot be set: {key!r} is a value and not a table")

@@ -66,6 +66,7 @@ def _locate(model: type[BaseModel], location: tuple[int | str, ...]) -> tuple[li
         while "$ref" in node:
             node = schema["$defs"][node["$ref"].rsplit("/", 1)[1]]
         if GROUP_KEY in node:
+            # This part of the location is the plug-in's name; the keys after it are those of its own model.
             schema = node = _GROUPS[node[GROUP_KEY]].load(str(part)).model_json_schema()
             continue
         if "mapping" in node.get("discriminator", {}) and part in node["discriminator"]["mapping"]:

@@ -32,6 +32,7 @@ def usual_tag_chunks(chunk_lines: int, shard_chunks: int, line_rate_hz: float, c
     Lines become readable with the chunk of their tags, so this chunk must not take long to complete.
     """
     most = min(USUAL_TAG_LINES, min(USUAL_CHUNK_S, commit_s) * line_rate_hz) / chunk_lines
+    # A shard holds whole chunks of tags, as it holds whole chunks of lines.
     return max(n for n in range(1, shard_chunks + 1) if shard_chunks % n == 0 and n <= max(1, most))
 
 

@@ -151,6 +151,7 @@ def _is_recorded(info: ValidationInfo) -> bool:
 
 def _default_to_prbs(value: Any) -> Any:
     """Make ``[code]`` without a ``kind`` pseudo-random, as it is in a rig without ``[code]``."""
+    # The discriminator of a union must be given: a default of `kind` alone is not used for it.
     return {"kind": "prbs", **value} if isinstance(value, dict) else value
 
 
@@ -229,6 +230,7 @@ class RigConfig(FrozenModel):
         """A camera delivers whole blocks: until one is full, its arm is silent."""
         if _is_recorded(info):
             return self
+        # Stalls are in the time of the host, in which simulated lines pass `speed` times as fast.
         passing_hz, most_s = self.line_rate_hz * self.simulation.speed, self.stall_timeout_s / 2
         if (block_s := self.stream.block_lines / passing_hz) > most_s:
             raise ValueError(
@@ -271,6 +273,7 @@ class RigConfig(FrozenModel):
         """The geometry must agree with the cameras' settings, as far as these are known."""
         for arm, camera in (("a", self.cameras.a), ("b", self.cameras.b)):
             for _, feature, value in camera.settings:
+                # SFNC has no name for this: feature and entries are named as in Vieworks' VT cameras.
                 if feature == "TDIStages" and value != f"TDI{self.geometry.stages}":
                     raise ValueError(
                         f"cameras.{arm}.settings: TDIStages is {value!r}, but geometry.stages is "
@@ -289,6 +292,7 @@ class RigConfig(FrozenModel):
         """The ring keeps filling while an event is detected and its recording is created."""
         if _is_recorded(info):
             return self
+        # The delay is in the time of the host, the history in that of the instrument.
         longest_s = self.history_s - EVENT_DELAY_S * self.simulation.speed
         if self.events.sources and self.events.pre_s > longest_s:
             raise ValueError(

@@ -41,6 +41,7 @@ def whole_schema(model: type[BaseModel]) -> dict[str, Any]:
             nested = definition.pop("$defs", {})
             definitions[f"{name}.{kind}"] = definition
             definitions.update({f"{name}.{kind}.{key}": value for key, value in nested.items()})
+            # A class may use other groups, or its own: the parts of a sum of scenes are scenes.
             waiting += _resolve_marks([definition, nested])
     return schema
 

@@ -111,6 +111,7 @@ class OptionsOf:
         driver = info.data.get("driver")
         if driver is None:
             return None  # the driver itself was refused, which is already an error
+        # Also for a table that is absent: its model then has the defaults, or refuses what it requires.
         model = _class_of(self.group, driver)
         if isinstance(value, model):
             return value
