@@ -66,6 +66,7 @@ class TimedCamera:
     """A simulated camera that is timed; see `TimedOpener`."""
 
     def __init__(self, camera: Camera, latencies: Latencies) -> None:
+        # Only a simulated camera knows when its lines were triggered.
         assert isinstance(camera, SimulatedCamera)
         self._camera, self._latencies = camera, latencies
 

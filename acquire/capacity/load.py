@@ -79,6 +79,7 @@ class Load:
     @property
     def substep_ticks(self) -> int:
         """Duration of a sub-step in ticks of a fixed clock, rounded to a whole number."""
+        # 5 ticks are the shortest sub-step of the trigger.
         return max(5, round(CLOCK_HZ / (self.line_rate_hz * self.substeps)))
 
     @property

@@ -103,6 +103,7 @@ def measure_parts(load: Load, directory: Path) -> Parts:
 def _pace(work: Callable[[int], int], finish: Callable[[], object] = lambda: None) -> Pace:
     """Return the pace of ``work(k)``, which processes the k-th block and returns its lines of one arm."""
     begun_s, begun_cpu_s, lines, k = time.perf_counter(), time.process_time(), 0, 0
+    # At least one block of each arm, however slow the part is.
     while time.perf_counter() - begun_s < PART_S or k < len(ARMS):
         lines += work(k)
         k += 1
@@ -119,6 +120,7 @@ def _pace_of_ring(load: Load, blocks: list[NDArray[Any]]) -> Pace:
         slot = ring.claim()
         assert slot is not None
         slot.pixels[:] = blocks[k % len(blocks)]
+        # As a grabber does, which looks for saturated pixels.
         slot.pixels.max()
         ring.commit(k * load.block_lines, load.block_lines)
         ring.acquire()

@@ -101,6 +101,7 @@ def run_load(load: Load, directory: Path, seconds: float) -> LoadReport:
         finally:
             capture.close()
     finally:
+        # Before the wire, to which the end of the pulses is written.
         trigger.close()
         wire.close()
         for histogram in latencies.values():
@@ -188,6 +189,7 @@ def capture_plan(load: Load, wire: Wire) -> CapturePlan:
         white_dn=camera.white_dn,
         openers=openers,
         line_period_ns=1e9 / load.line_rate_hz,
+        # Allowed although the cameras are simulated: these only copy stored lines, as a driver would.
         realtime=True,
     )
 

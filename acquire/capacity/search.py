@@ -50,6 +50,7 @@ def search_rate(
     while len(trials) < most_runs and bad > good * NEAR:
         try:
             trial = Trial(rate, run_load(replace(load, line_rate_hz=rate), directory, seconds))
+        # A capture path that fails at this rate is a result of the search, not its end.
         except (DataError, DeviceError) as error:
             trial = Trial(rate, None, str(error))
         trials.append(trial)
