@@ -65,15 +65,18 @@ class EffectContract:
         bench, again = small_bench((effect,)), small_bench((effect,)).camera("a", CODE)
         whole = bench.camera("a", CODE).read(-300, 900)
         parts, line = [], -300
+        # On and off the edges of tiles of 256 lines, before and after line 0.
         for count in (1, 255, 300, 7, 337):
             parts.append(again.read(line, count))
             line += count
         np.testing.assert_array_equal(np.concatenate([part.pixels for part in parts]), whole.pixels)
         np.testing.assert_array_equal(np.concatenate([part.missing for part in parts]), whole.missing)
+        # A new camera that begins here must not depend on the lines before.
         later = bench.camera("a", CODE).read(200, 300)
         np.testing.assert_array_equal(later.pixels, whole.pixels[500:800])
 
     def test_its_draws_are_its_own(self, effect: Effect) -> None:
+        # An effect that drew from the stream of numpy's old functions would depend on all others that do.
         before = np.random.get_state()[1].tolist()  # type: ignore[index]  # noqa: NPY002
         first = small_bench((effect,)).camera("a", CODE).read(0, 512)
         second = small_bench((effect,)).camera("a", CODE).read(0, 512)

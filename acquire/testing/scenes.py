@@ -44,6 +44,7 @@ class SceneContract:
     def test_frames_do_not_depend_on_how_they_are_asked(self, scene: SceneModel) -> None:
         shown, again = self.shown(scene), self.shown(scene)
         whole = shown.frames(FIRST, COUNT)
+        # The later part first, so that nothing may be carried over from the earlier one.
         later, earlier = again.frames(FIRST + 15, COUNT - 15), again.frames(FIRST, 15)  # in any order
         np.testing.assert_array_equal(np.concatenate([earlier, later]), whole)
         some = np.array([0, 1, 5, 17, COUNT - 1])

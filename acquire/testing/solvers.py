@@ -92,8 +92,10 @@ class SolverContract:
     def test_masked_samples_have_no_influence_and_twice_the_light_is_twice_the_video(self) -> None:
         segment, _ = blinking_segment()
         mask = segment.mask.copy()
+        # Lost lines, and a defective column.
         mask[0, 20:24] = mask[1, :, 3] = False
         clean = self.solve(replace(segment, mask=mask))
+        # Far above all others: any influence on the video would show.
         lines = np.where(mask, segment.lines, np.float32(1e6))
         spoilt = self.solve(replace(segment, mask=mask, lines=lines))
         np.testing.assert_array_equal(spoilt.video, clean.video)
