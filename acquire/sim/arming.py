@@ -39,6 +39,7 @@ def _timing(get: Callable[[r.Register], int]) -> Iterator[_Check]:
     yield not r.LIMITS.substep_min.of(limits) <= clocks <= longest, ErrorCode.BAD_SUBSTEP, r.SUBSTEP_CLOCKS
     possible = r.CAPABILITIES.substeps.of(get(r.CAPABILITIES))
     yield not possible >> substeps & 1, ErrorCode.BAD_SUBSTEPS, r.LINE
+    # The six sub-phases of a line's transfer are divided among its S sub-steps.
     yield 6 // substeps * get(r.PHASE_CLOCKS) > clocks, ErrorCode.BAD_PHASES, r.PHASE_CLOCKS
     yield get(r.TAG_INTERVAL) == 0, ErrorCode.BAD_TAG_INTERVAL, r.TAG_INTERVAL
 
@@ -70,6 +71,7 @@ def _outputs(get: Callable[[r.Register], int]) -> Iterator[_Check]:
     ):
         on = bool(enable.enable.of(get(enable)))
         yield on and get(width) == 0, code, width
+        # The next request must not come before this pulse has ended: the gateware would abandon its rest.
         yield on and get(delay) + get(width) >= distance, code, delay
     yield distance < get(r.CAMERA_MIN_PERIOD), ErrorCode.BAD_MIN_PERIOD, r.CAMERA_MIN_PERIOD
 

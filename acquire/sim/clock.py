@@ -46,7 +46,8 @@ _RECORD = struct.Struct("@II")
 _RECORD_AT = _SEQUENCE.size
 _PAYLOAD_AT = _RECORD_AT + _RECORD.size
 _ROOM = _PAGE - _PAYLOAD_AT - 64
-"""Bytes available for a train when it starts; 64 more are reserved for the count it stops after."""
+"""Bytes available for a train when it starts; 64 more are reserved for its start, a later budget and the
+count it stops after."""
 _POLL_S = 0.002
 """Polling interval while waiting for a start; pulses themselves are awaited by their due time."""
 _STOP_POLL_S = 0.008
@@ -164,8 +165,10 @@ class Wire:
         self.clock = clock
         self._descriptor = descriptor
         self._page = mmap.mmap(descriptor, _PAGE)
+        # A change reads the train and writes it back: two threads must not do so at the same time.
         self._writing = threading.Lock()
         self._known: tuple[int, PulseTrain | None] = (0, None)
+        # Without a reference to `self`, so that a wire that nobody holds is collected.
         self.close: Callable[[], object] = weakref.finalize(self, _release, self._page, descriptor)
 
     def __reduce__(self) -> tuple[object, ...]:
@@ -218,6 +221,7 @@ class Wire:
             train = latest.train
             if train is None or train.stopped_after is not None:
                 return latest.issued
+            # At least one: a run that has started has line 0, whenever it is told to end.
             allowed = self._write(
                 sequence, lambda now_ns: replace(train, budget=max(1, pulses, train.issued(now_ns)))
             )
@@ -251,6 +255,7 @@ class Wire:
 
     def _observe(self) -> tuple[int, Reading]:
         """Return a sequence number and the reading that belongs to it."""
+        # The host's own time: a clock that a test advances stands still while this waits.
         deadline_ns, nap_s = time.monotonic_ns() + int(_TORN_S * 1e9), _WRITE_S
         while time.monotonic_ns() < deadline_ns:
             sequence = self._sequence()

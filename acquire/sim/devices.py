@@ -215,6 +215,7 @@ class SimulatedCamera:
             assert reading.train is not None
             code = self._wire.code(reading.train)
             self._light = self._optics.expose(reading.train, code, self._config)
+        # Line 0 begins at pulse 0 and is read out M + 1 pulses later.
         first_line = self._first_pulse + self._delivered - self._depth_lines
         lines = self._light.read(first_line, count)
         if not lines.missing.any():

@@ -85,4 +85,5 @@ class CompiledTrigger(SimulatedTrigger):
         return rtl.baud(trigger.clock_hz) / BITS_PER_BYTE
 
     def possible(self, trigger: TriggerConfig) -> Capabilities:
+        # The compiled gateware has all of its inputs, the model only some.
         return GatewareTrigger.possible(self, trigger)

@@ -30,6 +30,7 @@ def mean_drive(drive: Drive, first: int, count: int, substep_s: float) -> NDArra
     cycles = phase(first, count, step, drive.phase_deg)
     match drive:
         case SineDrive():
+            # The mean of a sine over a step is the sine at its middle, times sinc(step).
             mean = (1 + np.sinc(step) * np.sin(2 * np.pi * (cycles + step / 2))) / 2
         case PulseDrive():
             mean = mean_over(lambda x: _pulse_area(x, drive.duty), cycles, step)

@@ -87,6 +87,7 @@ class SimulatedDevices:
         if not config.needs_scene:
             return
         file = find(config.scene_file(), kind="scene").stat()
+        # The inode as well: a file that replaces another one may have the same time.
         version = (file.st_mtime_ns, file.st_ino)
         if self._scene_version != version:
             scene = load_scene(config.scene_file())
@@ -128,6 +129,7 @@ class SimulatedDevices:
         columns = config.columns
         if not columns:
             return parts[arm]
+        # Both arms' parts, whichever arm was asked for: they are one sensor.
         return SideBySideOpener(
             tuple(parts.values()), tuple(columns[name][0] for name in ARMS), sensor_width(config)
         )

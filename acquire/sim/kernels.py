@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 
+# Without the interpreter's lock: `acquire simulate` reads each arm in a thread of its own.
 @numba.njit(cache=True, nogil=True)
 def add_along_rows(
     frames: NDArray[Any], light: NDArray[Any], newest: NDArray[Any], rows: NDArray[Any], out: NDArray[Any]

@@ -201,6 +201,7 @@ class FrameLines:
         begin, end = S * first_line, S * (first_line + count) + n - 1
         if first_line == self._next_line:
             gathered[:n] = self._unfinished
+            # Earlier frames were added by the last call, also to the packets that it left unfinished.
             begin += n - 1
         for first in range(begin, end, self._block):
             self._gather(packets, S * first_line, first, min(self._block, end - first))
@@ -224,6 +225,7 @@ class FrameLines:
             self._kernels.add_along_rows(frames, light[lit], newest, self._rows, packets)
         else:
             if self._rows[0] < self._rows[-1]:
+                # The kernel knows only one direction of the charge: from the last column to the first.
                 frames = frames[:, :, ::-1]
             self._kernels.add_along_columns(frames, light[lit], newest - (self._scene.size - 1), packets)
 

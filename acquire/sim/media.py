@@ -247,6 +247,7 @@ class _PictureFile:
         try:
             with Image.open(self._path) as image:
                 image.seek(index)
+                # Pillow would clip these modes to 8 bits when it converts them to "L".
                 if image.mode.startswith(("I", "F")):  # 16-bit or float
                     white = 1.0 if image.mode == "F" else 65535.0
                     light = np.asarray(image, np.float32) / white

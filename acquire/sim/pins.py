@@ -75,6 +75,7 @@ class PinPage:
 
         A page that is garbage-collected closes itself.
         """
+        # A memory map cannot be closed while arrays refer to it.
         self._header, self._light = np.empty(0, np.uint64), np.empty(0, np.uint8)
         self._page.close()
         self._close_descriptor()
@@ -87,6 +88,7 @@ class PinPage:
         """Publish the state of a run; ``light`` has one byte per sub-step that ended since the last call."""
         header = self._header
         header[_SEQUENCE] += np.uint64(1)
+        # The light of a new run is written from the beginning of the page again.
         done = 0 if run.number != header[_RUN] else int(header[_SUBSTEPS])
         places = (done + np.arange(len(light))) % ROOM
         self._light[places] = np.frombuffer(light, np.uint8)
@@ -165,6 +167,7 @@ class PinWire:
         return Reading(
             PulseTrain(
                 run=fields[_RUN],
+                # The pins show which pulses have come, not when: times count from the run's start.
                 start_ns=0,
                 line_period_ns=period_ns,
                 speed=Fraction(1),

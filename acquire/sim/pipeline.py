@@ -155,6 +155,7 @@ class Sensor(Camera):
         self._by_place = {
             place: [s for s in stages if s.place == place] for place in ("charge", "readout", "stream")
         }
+        # Without such effects no line depends on others or on draws, and no whole tile has to be computed.
         self._pointwise = not any(self._by_place.values())
         self._tiles: dict[int, Readout] = {}
 
@@ -306,6 +307,7 @@ def _sensor(
         black_level_dn=converter.black_level_dn,
         responsivity_dn=converter.responsivity_dn,
         gain_dn_per_e=bench.scene.system_gain_dn_per_e,
+        # On the one sensor of both arms ("ab"), the delay of camera A applies.
         settled_s=bench.settled_s.get(name[0], 0.0),
         lit_part=bench.lit_part,
         fibre=bench.fibre,
@@ -313,6 +315,7 @@ def _sensor(
     stages = _stages(bench, setting)
     images = []
     for arm, column in columns.items():
+        # On a shared sensor each image has the optics of its own arm; the rest of the camera is common.
         own = stages if arm == name else _stages(bench, replace(setting, arm=arm))
         images.append(
             _image(bench.scene.optics, arm, column, code=code, setting=setting, common=stages, own=own)
@@ -398,6 +401,7 @@ def _emulated(bench: Bench, arm: str, code: Code, converter: Converter) -> Merge
             f"lines up to {converter.white_dn} DN",
             possible="cameras with a wider pixel_format, such as Mono16, or fewer optics.raw_bits",
         )
+    # S² raw samples are added up, and with them their black levels.
     raw = replace(
         converter, white_dn=raw_white, black_level_dn=converter.black_level_dn / S**2, dtype="uint16"
     )

@@ -330,6 +330,7 @@ def expose(
     exact: NDArray[np.float64], geometry: Geometry, code: NDArray[np.uint8], camera: Camera, seed: int
 ) -> Segment:
     """Return Y of Eq. (1) as the 12-bit lines of a camera."""
+    # Not `seed` alone, from which the scene was drawn: noise must not repeat those draws.
     rng, top = np.random.default_rng([seed, 1]), exact.max()
     if np.isfinite(camera.full_well_e):
         electrons = rng.poisson(

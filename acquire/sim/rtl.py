@@ -121,6 +121,7 @@ def _first_report(process: subprocess.Popen[bytes]) -> dict[str, Any]:
     assert process.stdout is not None
     line, deadline_s = b"", time.monotonic() + _START_S
     while not line.endswith(b"\n") and (left_s := deadline_s - time.monotonic()) > 0:
+        # Not `readline`, which would wait for the end of a line for ever.
         if select.select([process.stdout], [], [], left_s)[0]:
             piece = os.read(process.stdout.fileno(), 4096)
             if not piece:

@@ -67,6 +67,7 @@ class Window:
     def cover(self, frames: NDArray[np.float32], substeps: NDArray[np.int64]) -> None:
         time_s = (substeps + 0.5) * self._substep_s % self._ends_s[-1]
         for frame, at_s in zip(frames, time_s.tolist(), strict=True):
+            # The remainder of a time just below 0 can be rounded to the end of the loop itself.
             number = min(int(np.searchsorted(self._ends_s, at_s, side="right")), len(self._phases) - 1)
             phase = self._phases[number]
             if phase.axis != "open":

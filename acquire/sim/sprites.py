@@ -106,6 +106,7 @@ class _Sprite:
         config = self._config
         orbit = self._turns(substeps, config.orbit_hz, config.orbit_phase_deg)
         if config.turn_hz is None:
+            # On a circle, the direction of motion is a quarter of a turn from that of the position.
             ahead = 0.25 if config.orbit_hz >= 0 else -0.25
             heading = orbit + ahead + config.turn_phase_deg / 360
         else:

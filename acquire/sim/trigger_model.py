@@ -71,6 +71,7 @@ class TriggerModel:
     def __init__(self, wire: Wire, clock_hz: int, speed: float = 1.0, serial: int = 0) -> None:
         self._wire = wire
         self._clock_hz = clock_hz
+        # By its decimal digits: 0.1 is a tenth, not the binary fraction next to it.
         self._speed = Fraction(str(speed))
         self._lock = threading.RLock()
         self._decoder = Decoder()
@@ -241,6 +242,7 @@ class TriggerModel:
         # Rounded up: not before its tick.
         start_ns = now_ns + -(-latency * rate.denominator // rate.numerator)
         self._zero = (start_ns, run.start_tick, self._speed)
+        # The watchdog is active from the run's first clock, whoever started the run.
         self._feed_watchdog(run.start_tick - self._lead() - RUN_CLOCKS)
         period_ns = Fraction(run.line_clocks * NS_PER_S, self._clock_hz)
         attrs = light_attrs(self.registers.get)
@@ -271,6 +273,7 @@ class TriggerModel:
         if run.state != State.RUNNING or not period:
             return
         run.bark_tick = tick + math.ceil(period * self._speed) + BARK_CLOCKS
+        # A host that falls silent makes no further call: the wire must know now where the pulses end.
         if self._wire.read().running:
             self._wire.allow(self._lines_allowed() or 0)
 

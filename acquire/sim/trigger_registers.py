@@ -69,6 +69,7 @@ class RegisterBank:
         length = self.get(r.CODE_LENGTH)
         if not 0 < length <= CODE_BITS:
             raise Refusal(ErrorCode.BAD_CODE_LENGTH, r.CODE_LENGTH.address)
+        # In whole words, as the protocol defines it.
         self.put(r.CODE_CRC, zlib.crc32(self._memory[: -(-length // 32) * 4]))
         self.code_checked = True
 
@@ -101,6 +102,7 @@ class RegisterBank:
             return
         register = _REGISTER_AT.get(address)
         if register is None:
+            # A block of registers is written by one request, and the map has holes: a 0 may be written there.
             if word or not 0 <= address < r.MAP_END:
                 raise Refusal(ErrorCode.BAD_ADDRESS, address)
             return
@@ -114,8 +116,10 @@ class RegisterBank:
             return
         if register.access == "config":
             self._demand_idle(address)
+        # CODE_CRC covers CODE_LENGTH bits: another length has not been checked.
         if register is r.CODE_LENGTH and word != self._words[address]:
             self.code_checked = False
+        # A register ignores the bits of a word above its own width.
         implemented = (1 << min(32, register.width - 32 * (address - register.address))) - 1
         self._words[address] = word & implemented
 

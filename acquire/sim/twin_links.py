@@ -43,6 +43,7 @@ class TwinTransport:
         self._demand_plugged()
         data = self._twin.take()
         if not data and self._fed.wait(_POLL_S):
+            # Before `take`: a request that comes in between is answered now or sets it again.
             self._fed.clear()
             data = self._twin.take()
         return data
@@ -77,6 +78,7 @@ class PtyTwin:
         self.path = os.ttyname(slave)
         # Held open until a driver opens it: a terminal that nobody holds open reads as hung up.
         self._slave = slave
+        # A driver that does not read must not stop the thread in which the twin lives.
         os.set_blocking(self._master, False)
         self._ending = threading.Event()
         self._thread = threading.Thread(target=self._carry_bytes, name="acquire-pty-twin", daemon=True)

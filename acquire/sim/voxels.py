@@ -40,6 +40,7 @@ def truth(
         voxel = np.arange(offset, offset + len(frames)) // temporal_merge
         begins = np.flatnonzero(np.diff(voxel, prepend=-1))
         summed = np.add.reduceat(_merge_plane(frames, spatial_merge), begins, axis=0)
+        # Added, because a voxel may begin in one block of frames and end in the next.
         voxels[voxel[0] : voxel[-1] + 1] += summed
     voxels /= np.bincount(np.arange(count) // temporal_merge)[:, None, None]
     return voxels.astype(np.float32)

@@ -99,6 +99,7 @@ class Effect(EffectConfig, ABC):
 
 def draws(effect: str, setting: Setting, tile: int, *, arm: str | None = None) -> np.random.Generator:
     """Return the random stream of one effect, arm and tile; it differs between realisations."""
+    # Keys must not be negative, and tiles of the preroll are: the sign is a word of its own.
     key = (*_name_key(effect, arm or setting.arm), setting.realisation, 1, tile & 0xFFFFFFFF, tile < 0)
     return np.random.Generator(np.random.PCG64(np.random.SeedSequence(setting.seed, spawn_key=key)))
 
@@ -110,4 +111,5 @@ def pattern(effect: str, setting: Setting) -> np.random.Generator:
 
 
 def _name_key(effect: str, arm: str) -> tuple[int, int]:
+    # Not `hash`, which differs between processes: lines must be the same in each.
     return zlib.crc32(effect.encode()), zlib.crc32(arm.encode())

@@ -49,6 +49,7 @@ class Misregistration(Effect):
         from scipy.ndimage import affine_transform
 
         alignment = Alignment(self.rows, self.columns, self.turn_deg, self.magnification)
+        # scipy asks for the source of each pixel of the result, which is the map backwards.
         inverse = np.linalg.inv(alignment.matrix)
         # Not "constant", with which a pixel that extends beyond the edge by a hundredth is entirely dark.
         mode: Literal["nearest", "grid-constant"] = "nearest" if self.beyond == "edge" else "grid-constant"

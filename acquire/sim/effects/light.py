@@ -42,6 +42,7 @@ class CodeErrors(Effect):
         """E′(t) = E(t − late), each bit flipped with probability ``flip_rate``; the same for both arms."""
 
         def flips(first: int, count: int) -> NDArray[np.uint8]:
+            # One light for both arms, and so the same wrong bits; none before the run, where it is off.
             drawn = draws("code_errors", setting, first // _TILE, arm="light").random(count)
             return (drawn < self.flip_rate).astype(np.uint8) * (np.arange(first, first + count) >= 0)
 
@@ -164,6 +165,7 @@ class Delays(Effect):
 
         def delayed(light: Illumination) -> Callable[[int, int], NDArray[Any]]:
             def compute(first: int, count: int) -> NDArray[Any]:
+                # The light of sub-step t falls into sub-step t + whole, and a part of it into the next one.
                 g = light.light(first - whole - 1, count + 1)
                 shared: NDArray[Any] = (1 - part) * g[:, 1:] + part * g[:, :-1]
                 return shared

@@ -96,6 +96,7 @@ class Adc(Effect):
 
     def stages(self, setting: Setting) -> list[Stage]:
         """Round DN to steps of (white + 1)/2^bits and clip it at ``saturation_dn``."""
+        # Not finer than 1 DN, to which the camera rounds in any case.
         step = max(1.0, (setting.white_dn + 1) / 2**self.bits)
         top = setting.white_dn if self.saturation_dn is None else min(self.saturation_dn, setting.white_dn)
 

@@ -119,6 +119,7 @@ class Module:
     def _register(self, feature: Feature, kind: str, tail: str) -> str:
         index = f'<pIndex Offset="{feature.size}">{feature.selector}Reg</pIndex>' if feature.selector else ""
         access = "WO" if feature.kind == "command" else "RW" if feature.writable else "RO"
+        # Not cachable: the producer changes some registers itself, such as PayloadSize.
         return (
             f'<{kind} Name="{feature.name}Reg"><Address>{self._base + feature.at}</Address>{index}'
             f"<Length>{feature.size}</Length><AccessMode>{access}</AccessMode>"

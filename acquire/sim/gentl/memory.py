@@ -147,6 +147,7 @@ class CameraMemory:
         """
         done = 0
         while done < len(lines):
+            # Half of the ring at most: a block that is larger than the ring would wait for ever.
             needed = min(len(lines) - done, self._capacity // 2)
             while (room := self._capacity - (self["HEAD"] - self["TAIL"])) < needed:
                 if self.request_pending or not self["PRESENT"]:
@@ -158,6 +159,7 @@ class CameraMemory:
             header = self.headers[slot : slot + count]
             header[:, 0] = np.arange(first_line + done, first_line + done + count)
             header[:, 1] = times_ns[done : done + count]
+            # Last: the producer takes lines as soon as HEAD counts them.
             self["HEAD"] += count
             done += count
         return True

@@ -101,6 +101,7 @@ class GigeCamera:
 
     def turn(self) -> None:
         """Serve what is due now; wait a moment if there is nothing."""
+        # While lines are wanted, the wait is that for the sensor, below.
         ready, _, _ = select.select(self._control, [], [], 0 if self._acquiring else _IDLE_S)
         for control in ready:
             self._answer(control)

@@ -91,6 +91,7 @@ class Registers:
         for at, text in texts.items():
             self.memory[at : at + len(text)] = text.encode()
         self.memory[ADDRESS : ADDRESS + 4] = address
+        # Version 1.0 of the standard, big-endian, one stream; time stamps of 10⁹ ticks per second are in ns.
         numbers = {0: 0x1_0000, DEVICE_MODE: 0x8000_0000, STREAM_CHANNELS: 1, HEARTBEAT_MS: 3000}
         numbers |= {CAPABILITY: _RESENDS, TICK_LOW: 1_000_000_000, PACKET_SIZE: 1400}
         for at, value in numbers.items():
