@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal, Protocol
 
 from acquire.errors import CameraError
+from acquire.text import shown
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
@@ -38,7 +39,7 @@ class Setting:
     value: Value
 
     def __str__(self) -> str:
-        return f"{self.module} {self.feature} = {self.value!r}"
+        return f"{self.module} {self.feature} = {shown(self.value)}"
 
 
 class Node(Protocol):
@@ -128,10 +129,12 @@ def coerce(setting: Setting, node: Node) -> Value:
     if value is None:
         raise CameraError(f"{setting}: the feature cannot have this value", possible=describe(node))
     if node.kind in ("integer", "float"):
+        assert not isinstance(value, str)
         low, high, step = node.limits()
-        inside = low <= float(value) <= high
+        # As it is: a file may hold an integer that no float can.
+        inside = low <= value <= high
         # The camera rounds floats to their steps, but insists on those of integers.
-        if not inside or (step and node.kind == "integer" and (float(value) - low) % step):
+        if not inside or (step and node.kind == "integer" and (value - low) % step):
             raise CameraError(f"{setting}: the value is out of range", possible=describe(node))
     elif node.kind == "enumeration" and value not in node.entries():
         raise CameraError(f"{setting}: the feature has no such entry", possible=describe(node))
@@ -181,7 +184,8 @@ def _integer(value: Value) -> int | None:
             return int(value, 0)
         except ValueError:
             return None
-    return None if isinstance(value, bool) or value != int(value) else int(value)
+    # The remainder of an infinite value is NaN, which counts as true.
+    return None if isinstance(value, bool) or value % 1 else int(value)
 
 
 def _real(value: Value) -> float | None:
@@ -189,7 +193,7 @@ def _real(value: Value) -> float | None:
         return None
     try:
         number = float(value)
-    except ValueError:
+    except (ValueError, OverflowError):
         return None
     return number if math.isfinite(number) else None
 
