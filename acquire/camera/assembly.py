@@ -78,6 +78,7 @@ def check_format(found: FrameFormat, spec: GenicamSpec) -> None:
 def buffer_count(spec: GenicamSpec, found: FrameFormat) -> int:
     """Return the number of buffers for ``buffer_s`` of lines, within limits."""
     size = found.height * found.layout.row_bytes(found.width)
+    # By time and not by number: 16 buffers that held 10 ms of lines were overrun on a loaded host.
     wanted = math.ceil(spec.buffer_s * spec.line_rate_hz / found.height)
     return max(_LEAST_BUFFERS, min(wanted, _MOST_BUFFER_BYTES // size))
 
@@ -85,6 +86,7 @@ def buffer_count(spec: GenicamSpec, found: FrameFormat) -> int:
 def read_settings(modules: Mapping[str, Features]) -> dict[str, Any]:
     """Return the current value of every readable number, entry, boolean and text of camera and stream."""
     facts: dict[str, Any] = {}
+    # The camera's own features last: of a name that both have, its value is the one to be recorded.
     for module in ("stream", "remote"):
         for name in modules[module].names() if module in modules else ():
             node = modules[module].find(name)
@@ -99,6 +101,7 @@ class MissedTriggers:
 
     def __init__(self, modules: Mapping[str, Features]) -> None:
         source = modules["remote"].find("CounterEventSource")
+        # Both are those of the counter that CounterSelector selects: no later setting may select another.
         counts = source is not None and source.readable and source.read() == "LineTriggerMissed"
         self._value = modules["remote"].find("CounterValue") if counts else None
         self._tally = Tally(self._read())
@@ -156,6 +159,7 @@ class Assembly:
         self._statistics["incomplete_frames"] += not frame.complete
         if frame.facts.frame_id is None:
             return [], self._wait(frame)
+        # False once waiting frames were given up: the rest could not fill the whole hole.
         keep = len(self._waiting) == self._unnumbered
         place = self._count.place(frame.facts, self._unnumbered, keep=keep)
         if place is None:
@@ -166,6 +170,8 @@ class Assembly:
             self._reader = LineReader.for_frames(
                 found.layout, found.width, frame.padding, found.height, frame.filled
             )
+        # Frames that waited are directly before this one. Kept frames leave no hole, so that there are no
+        # losses that `replace` would repeat with each.
         waiting, self._waiting, self._unnumbered = self._waiting, [], 0
         frames = [*waiting, frame] if place.kept else [frame]
         first = place.first_line - (len(frames) - 1) * self._format.height
@@ -193,9 +199,11 @@ class Assembly:
         """
         height, reader, filled = self._format.height, self._reader, frame.filled
         assert reader is not None
+        # Of a part of a frame only whole lines; the pitch of joined lines is rounded up, so never too many.
         count = height if filled >= reader.size(height) else filled // reader.pitch
         count = min(count, frame.rows or count)
         losses = self._owed + place.losses
+        # Losses are reported before a block, and these lines are after this one.
         self._owed = (CameraLoss(LossCause.INCOMPLETE, height - count),) if count < height else ()
         if not count:
             self._owed = losses + self._owed

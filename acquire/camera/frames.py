@@ -148,6 +148,7 @@ class FrameCount:
         losses = () if kept else tuple(self._explain(frame, lost, missed, min(unnumbered, lost)))
         first = self._next_line + missed + lost * self._height
         self._next_line = first + self._height
+        # Only now: the counter was read after this frame had come, so new misses are in it or after it.
         self._pending += frame.missed - self._missed
         self._missed = frame.missed
         self._doubtful = self._doubtful + 1 if self._pending else 0
@@ -172,12 +173,14 @@ class FrameCount:
 
     def _ahead(self, frame: FrameFacts, number: int) -> int | None:
         """Return the frames from the last one to this one, across a wrap; None if this is not after it."""
+        # Where the width is not known, a larger number is no sign of a wrap.
         if not self._id_bits and number >= self._last_id:
             return number - self._last_id or None
         # Assume the narrowest counter that can have produced the ids.
         bits = self._id_bits or next(bits for bits in _ID_BITS if self._largest_id < 1 << bits)
         ahead = (number - self._last_id) % (1 << bits)
         # More than half of the range ahead is less than half behind: a late frame, not a day of losses.
+        # While the width is only assumed, a smaller number may be a late frame, which its time shows.
         if ahead == 0 or ahead > 1 << (bits - 1) or (not self._id_bits and self._is_earlier(frame)):
             return None
         if number < self._last_id:
@@ -228,6 +231,7 @@ class FrameCount:
             yield CameraLoss(LossCause.MISSED_TRIGGER, missed)
         if incomplete:
             yield CameraLoss(LossCause.INCOMPLETE, incomplete * self._height)
+        # The count may include frames after this one: what is beyond this hole is left for later ones.
         starved = min(lost - incomplete, frame.underruns - self._underruns)
         self._underruns += starved
         if starved:

@@ -72,11 +72,13 @@ class Gauge:
         good = (flags & NO_IMAGE) == 0
         sums = Sums(int(good.sum()), lost + int(len(flags) - good.sum()))
         stride = max(1, -(-pixels.size // MOST_PIXELS))
+        # Signed and wider than the samples, since differences of unsigned numbers would wrap.
         seen = pixels[::stride][good[::stride]].astype(np.int32)
         if seen.size:
             steps = np.diff(seen, axis=1)
             sums.samples, sums.total, sums.brightest = seen.size, int(seen.sum()), int(seen.max())
             sums.saturated = int((seen >= self._white_dn).sum())
+            # The square of a 16-bit difference exceeds the range of int32.
             sums.steps, sums.energy = steps.size, int((steps.astype(np.int64) ** 2).sum())
         return sums
 

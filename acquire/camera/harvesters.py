@@ -139,6 +139,7 @@ class HarvestersCamera:
             self._monitor = acquirer._new_buffer_event_monitor_dict[self._stream]
             # GenTL counts STREAM_INFO_NUM_UNDERRUN since the stream was opened, not since it was started.
             self._underruns = Tally(self._read_underruns())
+            # Without harvesters' own thread, which kept only the last of ten frames and counted no underrun.
             acquirer.start()
             self._armed = True
         self._heard_s = time.monotonic()
@@ -185,6 +186,7 @@ class HarvestersCamera:
     def _take(self, buffer: Any) -> None:
         """Take a filled buffer, and assemble its frame to blocks."""
         complete = bool(buffer.is_complete())
+        # A producer without time stamps may refuse the query, or return 0.
         time_ns = _or(lambda: int(buffer.timestamp_ns), 0) or None
         # Buffers are announced once and reused: each becomes an array once, without a copy.
         key = buffer.context
@@ -254,6 +256,7 @@ class _Library:
                 raise CameraError(
                     f"harvesters cannot be imported: {error}", hint="pip install harvesters genicam"
                 ) from error
+            # Outside the tree of loggers, so that it gets the messages of this camera alone.
             logger = logging.Logger("harvesters", logging.WARNING)
             logger.addHandler(self._words)
             self._harvester = Harvester(config=ParameterSet({ParameterKey.LOGGER: logger}))
@@ -290,6 +293,7 @@ class _Library:
         with translated(f"open camera {camera.serial}", self._words), _signals_kept():
             acquirer = self._harvester.create(index)
         node_map = acquirer.remote_device.node_map
+        # A description that cannot be parsed is only logged; each access would then fail for another reason.
         if node_map is None or GenapiFeatures(node_map).find("Width") is None:
             raise CameraError(
                 f"camera {camera.serial}: its description cannot be used", hint=self._words.last
@@ -330,6 +334,7 @@ def _map_of(module: Any) -> Any:
 
 def _describe(info: Any) -> FoundCamera:
     texts = [_or(lambda name=name: str(getattr(info, name)), "") for name in _IDENTITY]
+    # A producer need not know serial numbers; its own ID of the camera then stands for one.
     if not texts[0]:
         texts[0] = _or(lambda: str(info.id_), "")
     status = _or(lambda: int(info.access_status), 0)
@@ -345,6 +350,7 @@ def _describe(info: Any) -> FoundCamera:
 
 
 _IDENTITY = ("serial_number", "model", "vendor", "version")
+# DEVICE_ACCESS_STATUS of GenTL. 0 is unknown and 1 is free for reading and writing.
 _ACCESS = {2: "open for reading only", 3: "not accessible", 4: "in use by another program", 5: "in use here"}
 
 

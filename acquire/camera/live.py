@@ -19,6 +19,7 @@ if TYPE_CHECKING:
 TURN_S = 0.2
 """Time between two readings."""
 _WAIT_S = 0.05
+# A camera whose link is gone takes long to close.
 _END_S = 30.0
 
 
@@ -88,6 +89,7 @@ def _look(mailbox: Mailbox, opener: CameraOpener, views: dict[str, View]) -> Non
                 camera.release(block)
             if time.monotonic() >= due_s:
                 mailbox.post(Readings({name: gauge.take() for name, gauge in gauges.items()}))
+                # Readings that a busy host has missed are left out, not made up for.
                 due_s = max(due_s + TURN_S, time.monotonic())
     finally:
         camera.close()

@@ -87,6 +87,7 @@ class LineReader:
         if layout.stored_bits == 8:
             return rows
         if layout.stored_bits == 16:
+            # A view although rows may have padding: numpy needs only the bytes of a row to be contiguous.
             return rows.view("<u2")
         return _UNPACK[layout.name](rows, self._width)
 
@@ -126,6 +127,7 @@ def _mono12p(rows: NDArray[np.uint8], width: int) -> NDArray[np.uint16]:
 
 def _mono10p(rows: NDArray[np.uint8], width: int) -> NDArray[np.uint16]:
     b = _groups(rows, 5)
+    # Pixel k has its low 8 − 2k bits in byte k, and its high 2k + 2 bits in byte k + 1.
     parts = [b[..., k] >> (2 * k) | (b[..., k + 1] & (1 << (2 * k + 2)) - 1) << (8 - 2 * k) for k in range(4)]
     return _join(parts, width)
 
@@ -138,6 +140,7 @@ def _mono12packed(rows: NDArray[np.uint8], width: int) -> NDArray[np.uint16]:
 
 def _mono10packed(rows: NDArray[np.uint8], width: int) -> NDArray[np.uint16]:
     b = _groups(rows, 3)
+    # As Mono12Packed, but only two of the four bits in each half of the middle byte are used.
     return _join([b[..., 0] << 2 | b[..., 1] & 3, b[..., 2] << 2 | b[..., 1] >> 4 & 3], width)
 
 

@@ -20,6 +20,7 @@ def find_producers(cti: str = "") -> list[Path]:
         if not path.is_file():
             raise CameraError(f"GenTL producer {cti}: there is no such file", hint="the path of a .cti file")
         return [path.absolute()]
+    # harvesters does not read the variable.
     directories = [Path(entry) for entry in os.environ.get(PATH, "").split(os.pathsep) if entry]
     found = [path for directory in directories for path in sorted(directory.glob("*.cti"))]
     if not found:

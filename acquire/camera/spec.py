@@ -45,6 +45,7 @@ def spec_of(config: RigConfig, arm: str, cti: str | None = None) -> GenicamSpec:
         serial=camera.serial,
         model=camera.model,
         settings=tuple(Setting(*setting) for setting in camera.settings),
+        # In the compact layout lines are as wide as the sensor, of which each arm takes its columns.
         pixels=0 if config.columns else config.pixels,
         bits=camera.bits,
         line_rate_hz=config.line_rate_hz,

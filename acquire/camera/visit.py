@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from acquire.processes.worker import Mailbox
 
 T = TypeVar("T")
+# A camera whose link is gone takes long to close.
 _END_S = 30.0
 
 

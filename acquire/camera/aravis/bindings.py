@@ -56,7 +56,6 @@ _SIGNATURES: dict[str, tuple[Any, tuple[Any, ...]]] = {
         (c_void_p, c_char_p, POINTER(c_uint), c_void_p),
     ),
     "arv_gc_feature_node_get_actual_access_mode": (c_int, (c_void_p,)),
-    "arv_gc_feature_node_is_locked": (c_bool, (c_void_p, c_void_p)),
     "arv_gc_category_get_features": (c_void_p, (c_void_p,)),
     "arv_stream_push_buffer": (None, (c_void_p, c_void_p)),
     "arv_stream_timeout_pop_buffer": (c_void_p, (c_void_p, c_uint64)),
@@ -119,6 +118,7 @@ def load() -> Any:
                 raise CameraError(
                     f"{name} is too old: it has no {function}", possible="Aravis 0.8.3 or later"
                 )
+            # Without them ctypes would take every pointer for an int of 32 bits.
             entry.restype, entry.argtypes = result, arguments
         return library
     raise CameraError(

@@ -191,8 +191,13 @@ class AravisCamera:
         self._heard_s = time.monotonic()
         assert self._stream is not None
         assert self._assembly is not None
-        missed, underruns = self._missed_triggers(), self._starved_frames()
+        try:
+            missed = self._missed.count()
+        except CameraError as error:
+            raise CameraLostError(f"camera {self._spec.serial} is gone: {error.message}") from error
+        underruns = self._starved_frames()
         for buffer in buffers:
+            # The stream was ended before this buffer was filled: it stands for no frame.
             if self._library.arv_buffer_get_status(buffer) == _ABORTED:
                 self._give(self._stream, buffer)
                 continue
@@ -203,15 +208,10 @@ class AravisCamera:
                 self._taken.remove(idle)
                 self._give(self._stream, idle)
 
-    def _missed_triggers(self) -> int:
-        try:
-            return self._missed.count()
-        except CameraError as error:
-            raise CameraLostError(f"camera {self._spec.serial} is gone: {error.message}") from error
-
     def _starved_frames(self) -> int:
         counts = c_uint64(), c_uint64(), c_uint64()
         self._library.arv_stream_get_statistics(self._stream, *map(byref, counts))
+        # Of completed, failed and starved buffers. Rounded up: a frame may be counted only in part so far.
         return math.ceil(counts[2].value / self._packets)
 
     def _frame(self, buffer: int, underruns: int, missed: int) -> Frame:
@@ -221,6 +221,7 @@ class AravisCamera:
         frame_id = library.arv_buffer_get_frame_id(buffer)
         complete = library.arv_buffer_get_status(buffer) == _SUCCESS and frame_id != _NO_ID
         facts = FrameFacts(
+            # Also of an incomplete frame: a number other than the mark has come with this frame.
             None if frame_id == _NO_ID else frame_id,
             underruns,
             missed,
@@ -234,6 +235,7 @@ class AravisCamera:
 
         In the latter case it answers, but is no longer controlled by this host, and sends nothing.
         """
+        # Reading a feature takes a round trip on the network.
         if time.monotonic() - self._heard_s < _ALIVE_S:
             return
         self._heard_s = time.monotonic()

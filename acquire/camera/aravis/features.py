@@ -145,6 +145,7 @@ class AravisNode:
     def _step(self) -> int:
         try:
             with errors(self.name) as error:
+                # A masked register has no increment, and can be written nevertheless.
                 step = self._library.arv_device_get_integer_feature_increment(self._device, self._key, error)
         except CameraError:
             return 1

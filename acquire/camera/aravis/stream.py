@@ -178,6 +178,7 @@ class StreamNode:
 def _properties(library: Any, owner: int) -> dict[str, _Property]:
     """Return the readable and writable properties of an object, without those of every stream or device."""
     count = c_uint()
+    # A GObject begins with the pointer to its class.
     specs = library.g_object_class_list_properties(c_void_p.from_address(owner).value, byref(count))
     found: dict[str, _Property] = {}
     for k in range(count.value):
@@ -246,7 +247,8 @@ def enlarge_sockets() -> None:
     for descriptor in Path("/proc/self/fd").iterdir():
         if not descriptor.is_socket():
             continue
-        # another thread may have closed it by now
+        # Another thread may have closed it by now. A copy, since the socket object closes its descriptor, and
+        # Aravis' must stay open.
         with contextlib.suppress(OSError), socket.socket(fileno=os.dup(int(descriptor.name))) as opened:
             if opened.family == socket.AF_INET and opened.type == socket.SOCK_DGRAM:
                 opened.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _receive_bytes())
