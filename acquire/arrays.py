@@ -72,6 +72,7 @@ def namespace(array: Array) -> Any:
 def host(array: Array) -> NDArray[Any]:
     """Return the array as a numpy array: itself, or a copy from the device."""
     if array_api_compat.is_cupy_array(array):
+        # numpy reads the memory of the host only, through DLPack as well.
         copied: NDArray[Any] = array.get()
         return copied
     return np.from_dlpack(array) if not array_api_compat.is_numpy_array(array) else array

@@ -35,6 +35,7 @@ class ClockFit:
         return int(self._utc_ns(tick))
 
     def _utc_ns(self, tick: Any) -> Any:
+        # Whole seconds apart: tick · 10⁹ would exceed 64 bits after 102 s at 90 MHz.
         seconds, rest = divmod(tick, self.clock_hz)
         return seconds * NS_PER_S + rest * NS_PER_S // self.clock_hz + self.utc_ns_at_tick_0
 

@@ -194,6 +194,7 @@ def code_from_attrs(attrs: Mapping[str, Any]) -> Code:
                 f"a prbs code of degree {degree} cannot have the taps {attrs['taps']}",
                 possible=f"taps {TAPS.get(degree)}",
             )
+        # In format 1, ``seed`` was the state of the register, not a number that a user gave.
         seed = attrs.get("seed") if "state" in attrs else None
         return PrbsCode(degree, register_state(attrs), None if seed is None else int(seed))
     if kind == "constant":

@@ -49,6 +49,7 @@ class ConverterCurve:
         """Return the derivative of `straight` at ``dn`` (arm, …)."""
         found = []
         for each, knots, excess in zip(dn, self.dn, self.excess_dn, strict=True):
+            # The index of the interval; readings beyond the knots get one, too, which `inside` discards.
             at = np.clip(np.searchsorted(knots, each) - 1, 0, len(knots) - 2)
             inside = (each > knots[0]) & (each < knots[-1])
             found.append(1 - np.where(inside, (np.diff(excess) / np.diff(knots))[at], 0.0))

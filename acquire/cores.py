@@ -35,6 +35,7 @@ def usable_cores() -> int:
 
 def idle_cores() -> int:
     """Return how many of the usable cores no other thread occupies now; at least one."""
+    # All threads of the machine are counted, so they are compared with all of its cores.
     spare = (os.cpu_count() or 1) - (_running() - 1)
     return max(1, min(usable_cores(), spare))
 
@@ -105,6 +106,7 @@ def _running() -> int:
     """Return the threads of this machine that run or want to, this one among them."""
     fewest = math.inf
     for _ in range(LOOKS):
+        # The fourth field is the number of running threads, a slash, and that of all threads.
         fewest = min(fewest, int(Path("/proc/loadavg").read_text(encoding="ascii").split()[3].split("/")[0]))
         time.sleep(LOOK_S)
     return max(1, int(fewest))
@@ -114,6 +116,7 @@ def _quota(root: Path = Path("/sys/fs/cgroup")) -> float:
     """Return the control group's quota in cores (version 2, or 1); infinite without a limit."""
     for files in ("cpu.max",), ("cpu/cpu.cfs_quota_us", "cpu/cpu.cfs_period_us"):
         if all((root / name).exists() for name in files):
+            # Version 2 has both numbers in one file.
             limit, period = " ".join((root / name).read_text(encoding="ascii") for name in files).split()
             return math.inf if limit in {"max", "-1"} else int(limit) / int(period)
     return math.inf

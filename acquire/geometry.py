@@ -91,6 +91,7 @@ class Geometry:
         trusted = self.trusted
         first = -(-trusted.start // temporal_merge)
         last = trusted.stop // temporal_merge
+        # Only with n = 1 is the span trusted to its end, and with it a last frame that may be short.
         if trusted.stop >= self.span:
             last = -(-self.span // temporal_merge)
         return slice(first, max(first, last))

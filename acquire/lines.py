@@ -248,10 +248,12 @@ def merged(segment: Segment, count: int) -> Segment:
         lines=total,
         mask=usable,
         geometry=Geometry(geometry.stages // count, count, geometry.lines // count),
+        # Both the merged line and its first raw line are read out n − 1 sub-steps after their start.
         time_ns=segment.time_ns[::count],
         first_line=segment.first_line // count,
         black_level_dn=tuple(black.tolist()) if black.ndim else float(black),
         responsivity_dn=1.0 if columns else segment.responsivity_dn,
         curve=None,
+        # Noise is known in DN, and corrected lines are in units of the scene.
         noise=None if columns or segment.noise is None else segment.noise.merged(count),
     )

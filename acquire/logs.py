@@ -72,6 +72,7 @@ def is_journal(file: int) -> bool:
         found = os.fstat(file)
     except OSError:
         return False
+    # The variable is inherited by programs whose output goes elsewhere, so it must name this very file.
     return os.environ.get("JOURNAL_STREAM") == f"{found.st_dev}:{found.st_ino}"
 
 

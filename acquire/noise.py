@@ -37,6 +37,7 @@ class Noise:
     def variance_dn2(self, light_dn: NDArray[Any]) -> NDArray[np.float64]:
         """Return the variance of samples (arm, line, pixel) that are ``light_dn`` above their black level."""
         K, dark = (np.reshape(each, (2, 1, 1)) for each in (self.dn_per_electron, self.dark_noise_dn))
+        # Noise takes dark samples below the black level, where light would be negative.
         variance: NDArray[np.float64] = QUANTISATION_DN2 + dark**2 + K * np.maximum(light_dn, 0.0)
         return variance
 
@@ -47,6 +48,8 @@ class Noise:
     def merged(self, count: int) -> Noise:
         """Return the noise of sums of ``count`` × ``count`` samples."""
         a, b = self.dark_noise_dn
+        # Variances add up, and K relates sums of light and of variance alike. Rounding counts once, as if the
+        # sensor had merged the samples.
         return Noise(self.dn_per_electron, (a * count, b * count))
 
     def with_ambient(self, light_dn: tuple[float, float]) -> Noise:

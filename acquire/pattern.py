@@ -53,9 +53,11 @@ class Pattern:
 def _table(pattern: Pattern) -> NDArray[Any]:
     """Return (row, pixel): one period and half of it again, so that few ranges cross its end."""
     rng = np.random.default_rng(ARMS.index(pattern.arm))
+    # Few rows of noise, which are repeated: the drift makes each repetition differ.
     few = pattern.rows // _NOISE_REPEATS + 1
     profile = 0.4 + 0.2 * np.sin(np.linspace(0, 20, pattern.pixels, dtype=np.float32))
     noise = rng.standard_normal((few, pattern.pixels), np.float32) * np.sqrt(profile / _FULL_WELL)
+    # Up to 90 % of the range, which leaves the drift the rest: no sample is white.
     dn = ((profile + noise) * pattern.white_dn).clip(1, 0.9 * pattern.white_dn - 1).astype(pattern.dtype)
     drift = np.linspace(0, 0.1 * pattern.white_dn, pattern.rows).astype(pattern.dtype)
     row = np.arange(pattern.rows + pattern.rows // 2) % pattern.rows

@@ -19,13 +19,10 @@ from dataclasses import dataclass, replace
 from functools import cache
 from importlib import metadata
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, get_args
+from typing import Any, get_args
 
 from acquire.errors import ConfigError
 from acquire.text import shortened, shown
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
 
 OURS = "tdi-acquire"
 _ENTRY_POINTS = "entry-points"
@@ -148,6 +145,7 @@ class _BrokenError(Exception):
 
 @cache
 def _found(group: str) -> tuple[Plugin, ...]:
+    """Return ours, then theirs, which are refused if the name is ours or if two distributions claim it."""
     ours = _found_ours(group)
     theirs = []
     for entry in metadata.entry_points(group=group):
@@ -155,8 +153,16 @@ def _found(group: str) -> tuple[Plugin, ...]:
         name, version = ("an unknown distribution", "") if dist is None else (dist.name, dist.version)
         if name != OURS:
             theirs.append(Plugin(group, entry.name, name, version, entry))
+    # In an order that does not depend on that of the search path.
     theirs.sort(key=lambda each: (each.name, each.distribution))
-    return (*ours, *_with_refusals(theirs, ours))
+    taken = {plugin.name for plugin in ours}
+    for number, plugin in enumerate(theirs):
+        origins = [other.origin for other in theirs if other.name == plugin.name]
+        if plugin.name in taken:
+            theirs[number] = replace(plugin, refused=f"the name is {OURS}'s own")
+        elif len(origins) > 1:
+            theirs[number] = replace(plugin, refused=f"{' and '.join(origins)} both have it")
+    return (*ours, *theirs)
 
 
 @cache
@@ -168,19 +174,6 @@ def _found_ours(group: str) -> tuple[Plugin, ...]:
     return tuple(
         Plugin(group, entry.name, OURS, own.version, entry) for entry in own.entry_points.select(group=group)
     )
-
-
-def _with_refusals(theirs: Sequence[Plugin], ours: Sequence[Plugin]) -> Iterator[Plugin]:
-    """Yield ``theirs``, refused if the name is ours or if two distributions claim it."""
-    taken = {plugin.name for plugin in ours}
-    for plugin in theirs:
-        origins = [other.origin for other in theirs if other.name == plugin.name]
-        refused = ""
-        if plugin.name in taken:
-            refused = f"the name is {OURS}'s own"
-        elif len(origins) > 1:
-            refused = f"{' and '.join(origins)} both have it"
-        yield replace(plugin, refused=refused)
 
 
 @cache

@@ -48,6 +48,7 @@ def open_regular(path: Path | str, flags: int = os.O_RDONLY, *, follow: bool = T
     """
     mode = os.stat(path, follow_symlinks=follow).st_mode  # noqa: PTH116 - for every chunk that is read
     if (kind := kind_of(mode)) is None:
+        # O_NONBLOCK: a pipe that has taken the place of the file since would keep `open` waiting.
         fd = os.open(path, flags | os.O_CLOEXEC | os.O_NONBLOCK | (0 if follow else os.O_NOFOLLOW))
         if (kind := kind_of(os.fstat(fd).st_mode)) is None:  # it may have been replaced since `stat`
             return fd
@@ -61,6 +62,7 @@ def read_regular(path: Path | str, most_bytes: int = MOST_BYTES, *, follow: bool
     fd = open_regular(path, follow=follow)
     with os.fdopen(fd, "rb") as file:
         size = os.fstat(fd).st_size
+        # One byte more than allowed shows a file that has grown since, or whose size is not stated.
         data = file.read(most_bytes + 1) if size <= most_bytes else b""
     if max(size, len(data)) > most_bytes:
         raise OddFileError(errno.EFBIG, f"it is larger than the limit of {most_bytes} bytes", str(path))
@@ -75,6 +77,7 @@ def parse_object(data: bytes) -> dict[str, Any]:
         raise ValueError("its JSON is nested too deeply") from None
     if not isinstance(document, dict):
         raise ValueError(f"a JSON object is expected, not {type(document).__name__}")  # noqa: TRY004
+    # Level by level, since a recursive check would fail where it is needed.
     level: list[Any] = [document]
     for _ in range(MOST_DEPTH):
         level = [

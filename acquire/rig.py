@@ -81,6 +81,7 @@ class Rig:
             return
         self._closed = True
         if self._simulated is not None:
+            # Before the trigger, whose pulses they read. The wire goes last, since a stop is written to it.
             self._simulated.close_cameras()
         self.trigger.close()
         if self._simulated is not None:

@@ -55,6 +55,7 @@ def as_picture(image: NDArray[Any], words: str) -> str:
         return ""
     if not image.size or image.size > MOST_SHOWN or not np.isfinite(image).all():
         return ""
+    # A few glaring pixels must not leave all others dark.
     white = float(np.quantile(image, 0.999)) or 1.0
     grey = np.clip(image.astype(np.float64) * (255 / white), 0, 255).astype(np.uint8)
     file = io.BytesIO()

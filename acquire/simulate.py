@@ -141,6 +141,7 @@ def simulate(
     spec = _spec(config, scene)
     writer = RecordingWriter.create(path, spec)
     tagger = Tagger(run, config.geometry.stages, spec.clock)
+    # There is no trigger whose tags could confirm the lines.
     tagger.confirmed_end = lines
     # One thread per arm, because a camera's blocks are read in order.
     with writer, ThreadPoolExecutor(1) as a, ThreadPoolExecutor(1) as b:
@@ -157,6 +158,7 @@ def study(bench: Bench, code: Code, lines: int = STUDIED_LINES) -> Study:
     stages = [stage for arm in ARMS for stage in bench.camera(arm, code).stages]
     place_of = {stage.effect: stage.place for stage in reversed(stages)}
     kinds = [effect.kind for effect in in_order(bench.scene.effects) if effect.kind in place_of]
+    # The pixels of lost lines are 0, which would count as a change of all that they held.
     bench = bench.without(LOSS)
     full = _sample(bench, code, lines)
     again = _sample(replace(bench, realisation=bench.realisation + 1), code, lines)

@@ -55,6 +55,7 @@ def own_words(message: str) -> str:
     return _PREFIX.sub("", message, count=1)
 
 
+# Not `repr`, which would first write out all of a large value.
 _REPR = reprlib.Repr()
 _REPR.maxstring = _REPR.maxother = 100
 _REPR.maxlevel = 3
