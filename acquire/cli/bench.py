@@ -69,6 +69,7 @@ def bench(
 
     rig = load_rig(config, parse_settings(settings or []))
     directory = (out or rig.recording.directory).absolute()
+    # Chosen before anything is measured, so that the limits are those of the codec that a run would use.
     chosen = choose_for(rig, directory=directory).codec if rig.recording.codec == "auto" else None
     load = Load.of(rig, chosen)
     with stage_progress("measuring ring, codec and disk"):

@@ -62,6 +62,7 @@ def linearity(
         exposures = _ramp(out, directory, lines, socket, ask=not yes)
     with stage_progress("evaluating the ramp") as advance:
         curve = save_finding(out, exposures[0], lambda known: evaluate(exposures, known, progress=advance))
+    # Only now: it straightens the levels by the curve that has just been saved.
     gain = save_finding(out, exposures[0], lambda known: transfer(exposures, known))
     if json:
         steps = {}

@@ -52,6 +52,7 @@ def instrument(socket: Path | None, directory: Path) -> Iterator[Client]:
             yield daemon
             calm_s = 0.0  # every command has been answered
         finally:
+            # The same run: the command ended before it armed anything, and there is nothing to restore.
             if _settled(daemon, calm_s).run_id != status.run_id:
                 _leave(daemon, directory, armed=status.state == "armed")
 
@@ -75,11 +76,13 @@ def record(
     from acquire.store import open_recording
 
     for _ in range(TRIES):
+        # Light and delays can be given only when arming.
         if daemon.status().state == "armed":
             daemon.disarm()
         daemon.arm(code=code, calibration="none", delays=delays, window=window)
         path = free_path(directory, name)
         status = daemon.start(path, lines=lines)
+        # An arm that has just been armed may show no rate yet.
         rates = [arm.rate_hz for arm in status.arms.values() if arm.rate_hz > 0]
         daemon.wait(SEALED, timeout_s=SEALED_S + lines / min(rates, default=1000.0))
         daemon.disarm()

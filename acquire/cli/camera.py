@@ -91,6 +91,7 @@ def snapshot(
     _check_out(path)
     with Bench(config) as bench:
         seconds = OPEN_S + lines / bench.line_rate_hz
+        # `armed`: the trigger starts only once the camera waits for its pulses.
         pixels, flags = visit(
             bench.opener(serial), take, lines, seconds, timeout_s=2 * OPEN_S + seconds, armed=bench.pulse
         )

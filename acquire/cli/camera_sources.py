@@ -139,6 +139,7 @@ class RingSource:
         time.sleep(TURN_S)
         if time.monotonic() > self._asked_s + ASK_S:
             self._asked_s = time.monotonic()
+            # The memory of a disarmed run stays mapped here, but nothing more comes into it.
             if self._client.rings().run_id != self._run_id:
                 raise StateError("the daemon was disarmed, so no more lines are arriving", hint="acquire arm")
         for arm, peek in self._peeks.items():

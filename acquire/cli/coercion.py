@@ -58,6 +58,7 @@ def use_quick_coercion(command: Any) -> None:
     """Replace the validators of a command and its subcommands; unknown versions of typer are left alone."""
     for parameter in command.params:
         _replace(parameter)
+    # The option for help is made only when it is needed, after this.
     makes_help = command.get_help_option
     command.get_help_option = lambda ctx: _replace(makes_help(ctx))
     for below in getattr(command, "commands", {}).values():

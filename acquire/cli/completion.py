@@ -128,6 +128,7 @@ def _paths(incomplete: str, suffixes: Iterable[str]) -> list[str]:
     found = []
     with suppress(OSError):
         for path in sorted(base.iterdir()):
+            # As shells do: hidden names are offered once a dot has been typed.
             hidden = path.name.startswith(".") and not begun
             if hidden or not path.name.startswith(begun) or not _PLAIN_NAME.fullmatch(path.name):
                 continue

@@ -86,6 +86,7 @@ def _about(name: str) -> str:
         line.lstrip("# ") for line in takewhile(lambda line: line.startswith("#"), text.splitlines())
     )
     table = tomllib.loads(text)
+    # "Fig. 8" does not end a sentence.
     sentence = re.split(r"(?<!Fig)[.;](?:\s|$)", comment, maxsplit=1)[0]
     return sentence or str(table.get("title") or table.get("name", ""))
 

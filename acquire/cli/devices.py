@@ -128,6 +128,7 @@ def _of_host() -> Iterator[Row]:
     for device, look in ways.items():
         empty = dict.fromkeys(COLUMNS, "") | {"device": device}
         try:
+            # Listed before the first is shown: an error then leaves one row, and no half of a list.
             yield from [empty | row for row in look()] or [empty | {"state": "none"}]
         except AcquireError as error:
             yield empty | {"state": str(error)}

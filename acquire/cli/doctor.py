@@ -56,6 +56,7 @@ def doctor(
     running: str | None = None  # version of the daemon that is running
     with suppress(AcquireError):
         running = Client(socket or (rig.control.socket if rig else None)).status().version
+    # A daemon that is running has the devices open, and may be recording.
     findings = [*examine(rig, running), *(_devices(config) if config and running is None else ())]
     if json:
         print_json([asdict(one) for one in findings])

@@ -100,6 +100,7 @@ def export(
         if all_frames:
             raise UsageError("--all-frames: a recording has no frames", possible="--all-frames with a video")
         first, count = lines_between(opened, first_line, lines, begin, end)
+        # Retention may have dropped the first lines of an endless recording.
         start = (opened.first_available_line if first is None else first) - opened.first_line
         stop = opened.lines if count is None else start + count
         content = recording_content(opened, range(start, stop, average))

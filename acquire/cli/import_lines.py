@@ -214,6 +214,7 @@ def _arms(
     if single is not None and (len(files) == 2 or all(columns.values())):
         raise UsageError(f"--arm {arm}: both arms were given", possible="--arm with a file of one arm")
     if len(files) == 2 or all(columns.values()):
+        # With a range of columns for each arm, both may come from one file, which is then opened twice.
         paths = {"a": files[0], "b": files[-1]}
         opened = {
             name: held.enter_context(open_lines(path, replace(layout, columns=columns[name])))
@@ -267,6 +268,7 @@ def _instrument(
         )
         if line_rate is not None or found.substeps != known.substeps:
             rate_hz = known.line_rate_hz if line_rate is None else line_rate
+            # Before `clock_of`, which would never end for a rate of 0.
             _check_sizes(found.stages, found.substeps, rate_hz)
             clock_hz, ticks = clock_of(rate_hz, found.substeps)
             found = replace(found, clock_hz=clock_hz, substep_ticks=ticks)
@@ -286,6 +288,7 @@ def _of_options(
             f"the lines cannot be imported without {absent}",
             possible="all of --stages, --substeps, --line-rate and --code, or --config RIG",
         )
+    # Before `clock_of`, which would never end for a rate of 0.
     _check_sizes(stages, substeps, line_rate)
     return Instrument(stages, substeps, light, *clock_of(line_rate, substeps), {})
 

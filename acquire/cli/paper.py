@@ -95,6 +95,7 @@ def paper(
                 with mpl.rc_context(STYLE):
                     figure = figure_of(open_recording(recording), studio, first_line)
             made.append(draw(figure, out, studio.host.busyness()))
+            # After every figure, so that an interrupted run leaves a page with those it has made.
             page = write_page(
                 made, studio, f"acquire {shlex.join(sys.argv[1:])}", datetime.now(UTC), recording
             )

@@ -305,19 +305,17 @@ def _make(
     """Make the videos one after the other, until the first that is interrupted."""
     outcomes: list[Outcome] = []
     for place, request in zip(places, prepared.requests.values(), strict=True):
-        options = _with_share(prepared.options, time.monotonic() - began, len(places) - len(outcomes))
+        options = prepared.options
+        if options.budget_s is not None:
+            # An equal share of what is left. Every limit counts from the command's start, so what has passed
+            # is added.
+            elapsed_s = time.monotonic() - began
+            share_s = (options.budget_s - elapsed_s) / (len(places) - len(outcomes))
+            options = replace(options, budget_s=max(elapsed_s + share_s, LEAST_S))
         outcomes.append(_run(recording, request, place, options, where, began))
         if outcomes[-1].interrupted:
             break
     return outcomes
-
-
-def _with_share(options: Options, elapsed_s: float, videos: int) -> Options:
-    """Set the time limit of the next video: an equal share of what is left, from the command's start on."""
-    if options.budget_s is None:
-        return options
-    left_s = options.budget_s - elapsed_s
-    return replace(options, budget_s=max(elapsed_s + left_s / videos, LEAST_S))
 
 
 def _tiles(recording: Recording, text: str | None, *, turned: bool) -> tuple[Tile, ...]:

@@ -273,6 +273,7 @@ def _write_plan(path: Path, plan: ReconstructionPlan) -> None:
     from acquire.store.delivery import whole_file
     from acquire.store.refusals import refused
 
+    # Checked before the plan was made, which takes time: it may exist by now.
     check_new_path(path)
     text = [f"{key} = {json.dumps(value)}" for key, value in plan.model_dump(exclude={"segments"}).items()]
     for part in plan.segments:

@@ -132,6 +132,7 @@ def _disk(disk: dict[str, float] | None) -> str | None:
     if disk is None:
         return None
     free, rate = quantity(disk["free_bytes"], "B"), quantity(disk["bytes_per_s"], "B/s")
+    # A disk that hardly fills lasts for longer than timedelta can express.
     seconds = min(disk["seconds_to_full"], timedelta.max.total_seconds() / 2)
     return f"{free} free, full in {timedelta(seconds=round(seconds))} at {rate}"
 

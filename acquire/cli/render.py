@@ -79,10 +79,12 @@ def render(
     check_suffix(out)
     check_new_path(out)
     panels = [Panel(PurePosixPath(place).stem, open_video(place)) for place in video]
+    # The suffix stays, since it sets the format.
     part = out.with_name(f".{os.getpid()}.{out.name}")
     try:
         with stage_progress(f"rendering {out.name}") as advance:
             shown = draw(panels, part, look, count, advance)
+        # Again: a rename would replace what another program has put there in the meantime.
         check_new_path(out)
         part.rename(out)
     finally:

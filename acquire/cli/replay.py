@@ -122,6 +122,7 @@ def _local_recording(place: str) -> Iterator[Recording]:
                 f"{place} cannot be replayed: it is not sealed",
                 hint=f"acquire stop, if it is being written, or acquire recover {place}",
             )
+        # Only now, so that what cannot be replayed is not downloaded.
         if isinstance(stored.source, RemoteSource):
             directory = Path(held.enter_context(tempfile.TemporaryDirectory(prefix="acquire-")))
             stored = open_recording(_download(stored.source, directory / place.rpartition("/")[2]))

@@ -101,6 +101,7 @@ def _line(recording: Recording, text: str) -> int:
         lambda line: round((line - recording.first_line) * period_ns),
     )
     assert ns is not None  # it is None only for an absent text
+    # Moments are rounded to whole nanoseconds, so the tolerance is one at least.
     return recording.first_line + math.ceil(ns / period_ns - max(ROUNDING, 1 / period_ns))
 
 

@@ -165,6 +165,7 @@ def _measure(
         with activity_progress(f"preparing {case.name}"):
             judge = case.judge(repeat)
         for voxels, (solver, preset, dtype) in itertools.product(kinds, combinations):
+            # The page says how busy the host was, since that decides the times.
             host.look()
             what = f"{case.name}: {solver} {preset} {voxels}, {repeat + 1} of {repeats}"
             with stage_progress(what) as advance:

@@ -152,6 +152,7 @@ def stop(
     Example: [bold]acquire trigger stop --url /dev/ttyUSB0[/]
     """
     with device_of(config, url, settings) as (driver, _):
+        # This opens the link, without which `stop` would have nothing to end.
         driver.device()
         lines = driver.stop()
     if json:

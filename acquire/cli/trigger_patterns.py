@@ -112,6 +112,7 @@ def _run(
         tag_every_lines=rig.trigger.tag_every_lines,
     )
     with stop_on_interrupt("turning the light off") as stop_requested:
+        # Not during a run, which may read its code from the same memory.
         if device.status().at_rest:
             device.load_code(wave.bits)
         driver.prepare(run)  # refuses if another run is in progress

@@ -84,6 +84,7 @@ def run(words: Sequence[str]) -> int:
     except typer.Abort:
         return EXIT_INTERRUPTED
     except _ParseError as error:
+        # A group without a subcommand prints its help, which is this error's message.
         if type(error).__name__ == "NoArgsIsHelpError":
             say_lines(error.format_message(), err=True)  # type: ignore[attr-defined]
             return UsageError.exit_code

@@ -96,6 +96,7 @@ def _settings(
 
     if given is not None:
         facts = json.loads(given)
+        # As JSON: of Python objects, the strict models would refuse a list for a tuple, or a text for a path.
         settings = WebConfig.model_validate_json(json.dumps(facts["web"]))
         return Path(facts["socket"]), Path(facts["directory"]), settings
     rig = None if config is None else load_rig(config)

@@ -133,6 +133,7 @@ class AsyncClient:
                     if isinstance(item, News):
                         yield item
             except NoDaemonError:
+                # The time counts from the first failure; any sign of life since then has reset it.
                 lost_s = lost_s or time.monotonic()
                 if time.monotonic() - lost_s > PATIENCE_S:
                     raise
@@ -158,14 +159,16 @@ class AsyncClient:
                     status = part
                     continue
                 rest += part
-                if status >= core.BAD:
-                    core.fact("events", Status).read(status, rest, self._target)
-                *lines, rest = rest.split(b"\n")
+                lines: list[bytes] = []
+                if status < core.BAD:  # an error may come in several parts, and is read below
+                    *lines, rest = rest.split(b"\n")
                 if len(rest) > core.MOST_LINE_BYTES:
                     raise NoDaemonError(f"the daemon on {self._target} sends a line of news that is too long")
                 for line in lines:
                     for item in reader.take(line.decode().rstrip("\r")):
                         yield item
+            if status >= core.BAD:
+                core.fact("events", Status).read(status, rest, self._target)
         raise NoDaemonError(f"the daemon on {self._target} has ended")
 
     async def call(self, call: Call[T]) -> T:
@@ -230,6 +233,7 @@ class AsyncClient:
     async def _connect(self) -> tuple[asyncio.StreamReader, asyncio.StreamWriter]:
         target = self._target
         if target.socket is not None:
+            # `connect` also checks who listens, and waits for a busy daemon: it must not block the loop.
             connection = await asyncio.to_thread(connect, target.socket, core.CONNECT_TIMEOUT_S)
             connection.setblocking(False)
             return await asyncio.open_unix_connection(sock=connection)

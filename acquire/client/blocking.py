@@ -226,11 +226,13 @@ class Client:
                     lost_s = None
                     if isinstance(item, News):
                         yield item
+                    # The first sign of life comes after the known news, which are never cut short.
                     elif end_s is None and timeout_s is not None:
                         end_s = time.monotonic() + timeout_s
                     if end_s is not None and time.monotonic() >= end_s:
                         return
             except NoDaemonError:
+                # The time counts from the first failure; any sign of life since then has reset it.
                 lost_s = lost_s or time.monotonic()
                 if time.monotonic() - lost_s > PATIENCE_S:
                     raise
@@ -289,6 +291,7 @@ class Client:
 
     @contextlib.contextmanager
     def _connection(self, timeout_s: float) -> Iterator[http.client.HTTPConnection]:
+        # The library would connect by TCP: it gets a socket that is connected already.
         connection = http.client.HTTPConnection("acquire")
         connection.sock = self._connect()
         connection.sock.settimeout(timeout_s)
@@ -324,6 +327,7 @@ class Client:
                 status = self.status()
             except NoDaemonError:
                 return  # it is gone or hangs, which the connection will show
+            # `stop` is answered once the recording is sealed, and the daemon is not busy meanwhile.
             if status.busy is not None or status.state is State.DRAINING:
                 self._tell(status.busy or str(status.state))
                 deadline = time.monotonic() + timeout_s

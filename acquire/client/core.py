@@ -115,6 +115,7 @@ class Call(Generic[T]):
         return None if self.body is None else json.dumps(self.body.model_dump(mode="json")).encode()
 
     def headers(self, target: Target) -> dict[str, str]:
+        # Each call has its own connection, of which the daemon keeps only a few open.
         headers = {"Connection": "close", **target.headers()}
         if who := WHO.get():
             headers[HEADER] = who
@@ -154,6 +155,7 @@ def arm(*, request_id: str | None, **how: Any) -> Call[Status]:
 
 def start(path: Path | str | None, request_id: str | None, **budget: Any) -> Call[Status]:
     """Return the command; a relative ``path`` is relative to the caller's directory."""
+    # The daemon has another working directory.
     absolute = None if path is None else Path(path).absolute()
     return command("start", Status, request("start", StartRequest, path=absolute, **budget), request_id)
 
@@ -221,6 +223,7 @@ class EventReader:
                 raise AcquireError(
                     "the daemon runs another version of this program: its news cannot be read"
                 ) from error
+            # Only now: an event that could not be decoded is not counted as received.
             if isinstance(item, News):
                 self.last_id = item.id
             yield item

@@ -1,7 +1,7 @@
 """The daemon's automatic commands after its start: `[service] begin`.
 
 A daemon that was restarted after a crash arms or records according to the rig. A refusal is reported and
-retried; once a user gives a command, the automatic ones end.
+retried, that of the recording too; once a user gives a command, the automatic ones end.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable
 
     from acquire.config.service import ServiceConfig
+    from acquire.daemon.messages import Status
     from acquire.daemon.service import Service
 
 log = logging.getLogger("acquire.daemon")
@@ -30,9 +31,12 @@ async def begin(
     if config.begin == "idle":
         return
     log.info("service.begin: %s", config.begin)
-    while service.status().state is State.IDLE:
+    ours: str | None = None
+    while _is_untouched(status := service.status(), ours):
         try:
-            await run(lambda: service.arm(ArmRequest()))
+            if status.state is State.IDLE:
+                await run(lambda: service.arm(ArmRequest()))
+                ours = service.status().run_id
             if config.begin == "recording":
                 await run(lambda: service.start(StartRequest()))
         except AcquireError as error:
@@ -42,3 +46,10 @@ async def begin(
         else:
             return
         await asyncio.sleep(config.retry_s)
+
+
+def _is_untouched(status: Status, ours: str | None) -> bool:
+    """Return whether nothing was armed yet, or the run ``ours`` was, and no other command has come since."""
+    if ours is None:
+        return status.state is State.IDLE
+    return status.state is State.ARMED and status.run_id == ours and status.last is None

@@ -136,6 +136,7 @@ class Connection(H11Protocol):
             others = [cast("Connection", one) for one in self.connections if one is not self]
             idle = [one for one in others if not one.is_working] or [self]
             longest = min(idle, key=lambda one: one._waiting_since or 0.0)
+            # Now: `connection_lost` comes in a later turn of the loop, and until then it would be counted.
             self.connections.discard(longest)
             longest.transport.abort()
             log.warning("more than %d connections: the longest idle one is closed", self.most_connections)
@@ -149,6 +150,7 @@ class Connection(H11Protocol):
 
     def on_response_complete(self) -> None:
         super().on_response_complete()
+        # An answer may precede the end of its request, such as 413: the rest stays limited in time.
         if not self.cycle.more_body:
             self._cancel()
             self._waiting_since = self.loop.time()

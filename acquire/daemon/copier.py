@@ -195,6 +195,7 @@ class Copier:
             self._put_off(job, "it is open, and not recovered yet", f"acquire recover {job.path}")
             return False
         job.lock.enter_context(only_copy(job.path))
+        # Reading messages before each write ends the copy soon after its owner has gone.
         job.mirror = Mirror(job.path, job.status.url, pause=self._read_messages)
         return True
 

@@ -60,6 +60,8 @@ class DiskWatch:
         self._free_bytes = free_bytes
         self._now_s = now_s
         self._looks: deque[tuple[float, int]] = deque()
+        self._changing = threading.Lock()
+        """Held while `_looks` is changed, and never during a query."""
         self._asked_s = -LOOK_EVERY_S
         self._thread: threading.Thread | None = None
 
@@ -70,8 +72,9 @@ class DiskWatch:
     def check(self, *, recording: bool) -> None:
         """Query again, if it is time and the last query was answered."""
         if not recording:
-            while len(self._looks) > 1:  # other programs' writes do not predict the next recording
-                self._looks.popleft()
+            with self._changing:
+                while len(self._looks) > 1:  # other programs' writes do not predict the next recording
+                    self._looks.popleft()
         if self._thread is not None and self._thread.is_alive():
             return
         if self._now_s() - self._asked_s < LOOK_EVERY_S:
@@ -84,11 +87,13 @@ class DiskWatch:
         try:
             free = self._free_bytes(self._directory)
         except OSError:  # gone or inaccessible: the status becomes None
-            self._looks.clear()
+            with self._changing:
+                self._looks.clear()
             return
-        self._looks.append((self._now_s(), free))
-        while self._looks[0][0] < self._looks[-1][0] - WINDOW_S:
-            self._looks.popleft()
+        with self._changing:
+            self._looks.append((self._now_s(), free))
+            while self._looks[0][0] < self._looks[-1][0] - WINDOW_S:
+                self._looks.popleft()
 
     @property
     def status(self) -> DiskStatus | None:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import ctypes
 import os
+import re
 import resource
 import shutil
 import socket
@@ -101,6 +102,7 @@ def _plugins() -> Finding:
 
 
 def _descriptors() -> Finding:
+    # The hard limit, to which the daemon raises its soft one (`connections.raise_descriptor_limit`).
     _, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     if hard == resource.RLIM_INFINITY or hard >= LEAST_DESCRIPTORS:
         return Finding("descriptors", "good", f"a process may have {'any number' if hard < 0 else hard}")
@@ -186,7 +188,10 @@ def _file_system(path: Path) -> str:
     best, kind = "", ""
     for line in _read(Path("/proc/self/mounts")).splitlines():
         _, place, found, *_ = line.split(" ")
+        # The kernel writes a space in a name as \040, and other odd characters likewise.
+        place = re.sub(r"\\([0-7]{3})", lambda code: chr(int(code[1], 8)), place)
         inside = str(path) == place or str(path).startswith(place.rstrip("/") + "/")
+        # Of two mounts at one place, the later one hides the earlier.
         if inside and len(place) >= len(best):
             best, kind = place, found
     return kind
@@ -208,6 +213,7 @@ class _Timex(ctypes.Structure):
 
 def _clock() -> Finding:
     timex = _Timex()
+    # With `modes` = 0 the call changes nothing, and needs no rights.
     state = ctypes.CDLL(None).adjtimex(ctypes.byref(timex))
     if state < 0:
         return Finding("clock", "warning", "the kernel does not say whether the clock is set by others")
@@ -277,6 +283,7 @@ def _port(rig: RigConfig | None) -> Iterator[Finding]:
         return
     family = socket.AF_INET6 if ":" in rig.web.host else socket.AF_INET
     with socket.socket(family) as probe:
+        # As the page does, so that connections that have just been closed do not count.
         probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:
             probe.bind((rig.web.host, rig.web.port))

@@ -51,6 +51,7 @@ class LastResort:
             self._timer = None
 
     def _end(self, seconds: float) -> None:
+        # Logged first: once the process has ended, nothing shows which thread hung.
         log.error("not ended after %g s, ending by force: %s", seconds, "; ".join(busy_threads()))
         self._clean_up()
         logging.shutdown()
@@ -64,6 +65,7 @@ def leave(code: int) -> int:
         thread.join(max(0.0, deadline - time.monotonic()))
     if _others():
         log.warning("ended without waiting for %s", "; ".join(busy_threads()))
+        # `os._exit` flushes nothing.
         logging.shutdown()
         sys.stdout.flush()
         os._exit(code)

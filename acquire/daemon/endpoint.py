@@ -66,6 +66,7 @@ class Endpoint:
         if self._lock < 0:
             return
         self.socket.close()
+        # Before the lock is released: afterwards the name may be that of the next daemon's socket.
         self.remove()
         os.close(self._lock)
         self._lock = -1
@@ -82,6 +83,7 @@ def _own(directory: Path) -> None:
         with contextlib.suppress(OSError):  # if it cannot be created, the checks below report why
             directory.mkdir(mode=0o700)
     try:
+        # In /tmp anybody could have made the name a link; XDG_RUNTIME_DIR was chosen for this user.
         found = directory.lstat() if in_tmp else directory.stat()
     except OSError as error:
         raise UsageError(
@@ -116,6 +118,7 @@ def _lock(path: Path) -> int:
         )
     try:
         fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        # Only under the lock: until then the file has the number of its owner, which the refusal names.
         os.ftruncate(lock, 0)
         os.pwrite(lock, f"{os.getpid()}\n".encode(), 0)
     except BlockingIOError:

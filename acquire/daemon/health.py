@@ -27,6 +27,7 @@ _RANK = {"good": 0, "unknown": 0, "warning": 1, "bad": 2}
 
 def health_of(status: Status, line_rate_hz: float, age_s: float = 0.0) -> Health:
     """Judge a status. ``line_rate_hz``: expected line rate; ``age_s``: time since arming."""
+    # Without a run, the counts are those of the last one.
     lost = sum(sum(arm.lost.values()) for arm in status.arms.values()) if status.run_id else 0
     checks = [*_of_arms(status, line_rate_hz, age_s), *_of_service(status)]
     worst = max((check for check in checks), key=lambda check: _RANK[check.level])

@@ -41,6 +41,7 @@ class Hooks:
         """Use the hooks of ``config`` from now on."""
         self._config = config
         if (config.command or config.webhook) and not self._thread.is_alive():
+            # What happened while there was no hook is not sent.
             self._last_id = self._news.last_id
             self._news.listen(self._happened.set)
             self._thread.start()
@@ -56,6 +57,7 @@ class Hooks:
     def _run(self) -> None:
         while True:
             self._happened.wait()
+            # Before the look, so that news that come while hooks are at work wake it again.
             self._happened.clear()
             found = self._news.after(self._last_id)
             self._last_id = found[-1].id if found else self._last_id

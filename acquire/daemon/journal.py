@@ -54,11 +54,13 @@ class Journal:
         left = [str(path) for path in paths]
         if self._file is None or left == self._written:
             return
+        # Set even if writing fails: the error is logged once, and the next change tries again.
         self._written = left
         try:
             if left:
                 text = json.dumps({self._key: left}, indent=1).encode()
                 scratch = self._file.with_name(f"{self._file.name}.next")
+                # Replaced as a whole, since the daemon may be killed at any moment.
                 Publisher(scratch).replace(self._file, text, durable=True)
             else:
                 self._file.unlink(missing_ok=True)

@@ -56,6 +56,7 @@ class Local:
     async def stop(self) -> Status:
         """Stop, and return once the recording is sealed. Raises a fault that occurs in the meantime."""
         await self._do("stop", self._service.stop)
+        # Waiting here, and not in the devices' thread, keeps marks possible while the recording drains.
         while (status := self._service.status()).state is State.DRAINING:
             await asyncio.sleep(POLL_S)
         if status.state is State.FAULTED:
@@ -101,9 +102,11 @@ class Local:
         return self._streams.open(last_id, status_s, history=history)
 
     async def _do(self, name: str, command: Callable[[], None]) -> Status:
+        # Read here: the devices' thread does not have this request's context.
         who = WHO.get()
 
         def signed() -> None:
+            # Signed afterwards: a refused command leaves no trace, and a start is noted in its own recording.
             command()
             if who:
                 self._service.sign(name, who)

@@ -56,6 +56,7 @@ class NewsLog:
             made = f"{self.life}-{self._count}"
             now = datetime.now(UTC)
             self._kept.append(News(id=made, time=now, kind=known, text=text, state=self._state, **facts))
+        # Without the lock, which a listener that reads at once needs.
         self.wake()
 
     def update(self, status: Status) -> None:

@@ -15,6 +15,7 @@ def notify(message: str) -> bool:
     if not address.startswith(("/", "@")):
         return False
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_NONBLOCK) as sender:
+        # "@" stands for the NUL byte with which an abstract address begins.
         try:
             sender.sendto(message.encode(), address.replace("@", "\0", 1) if address[0] == "@" else address)
         except OSError:

@@ -70,6 +70,7 @@ class Page:
             return
         self._begun_s = now_s
         try:
+            # In a session of its own: Ctrl-C on the terminal ends the daemon, which then ends the page.
             self._process = subprocess.Popen(  # noqa: S603 - this package
                 self._words, stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, start_new_session=True
             )

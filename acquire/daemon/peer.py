@@ -56,6 +56,7 @@ def connect(path: Path, timeout_s: float) -> socket.socket:
 def _check_owner(path: Path) -> None:
     """Check that only this user or root can have created the socket, or can replace it."""
     directory = path.parent.stat()
+    # In a sticky directory, such as /tmp, others cannot replace a socket that is not theirs.
     others_write = directory.st_mode & 0o022 and not directory.st_mode & stat.S_ISVTX
     for owner in (directory.st_uid, path.stat().st_uid):
         if owner not in (0, os.geteuid()):

@@ -104,6 +104,7 @@ def _salvage(mailbox: Mailbox, task: Task) -> RecoveryStatus:
         if not task.ours and not is_here(attributes or {}):
             return RecoveryStatus(path=path, state="left", text=_ELSEWHERE)
         reason = f"{RECOVERED}{task.why}" if task.why else Circumstances().reason
+        # Not `alone`: without locks nothing shows whether another process still writes the recording.
         known = Circumstances(reason, has_run_on(attributes or {}), alone=False, notes=task.notes)
         done = recover(path, progress=lambda *_: _check_owner(mailbox), known=known)
     except StateError as error:
@@ -155,6 +156,7 @@ def hindrance(task: Task) -> RecoveryStatus | None:
     path = task.path
     try:
         refuse_link(path, path)
+        # Only a try, before a process is started for it: `recover` takes the lock again.
         with locked(path, "recovering", surely=True):
             return None
     except StateError as error:

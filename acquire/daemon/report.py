@@ -40,6 +40,7 @@ class Rates:
             changes = self._changes.setdefault(arm, deque())
             if not changes or counts["delivered"] != changes[-1][1]:
                 changes.append((now_s, counts["delivered"], counts.get("saturated", 0)))
+            # One change from before the window stays, so that the rates cover all of it.
             while len(changes) > 2 and changes[1][0] <= now_s - RATE_WINDOW_S:
                 changes.popleft()
 

@@ -71,6 +71,7 @@ async def _note_who(
         Header(max_length=LONGEST, pattern="^[ -~]+$", description="user, for the log and the recording"),
     ] = None,
 ) -> None:
+    # The page has already set it from a token, and a header must not replace that.
     if acquire_by and not WHO.get():
         WHO.set(acquire_by)
 

@@ -219,6 +219,7 @@ class Salvage:
         return [status]
 
     def _cut_off(self) -> None:
+        # Its task stays in the list, so that the recovery is begun again later.
         worker, self._worker, self._under_way = self._worker, None, None
         if worker is not None:
             _end(worker, 0.0)

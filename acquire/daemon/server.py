@@ -80,6 +80,7 @@ def serve(config: RigConfig, origin: str = "", reread: Callable[[], RigConfig] |
         proof = Proof(config)
 
         def open_run(request: ArmRequest) -> Run:
+            # Not the outer `config`: the service's may have been reloaded.
             config = armed_as(service.config, request)
             check_rig(config)
             return Run(config, rig, proof.choose)
@@ -88,6 +89,7 @@ def serve(config: RigConfig, origin: str = "", reread: Callable[[], RigConfig] |
         service.origin = origin
         page, hooks = Page(endpoint.path), Hooks(config.hooks, service.news, config.name)
         reloading = None if reread is None else Reloading(reread, service, hooks)
+        # Closed after the loop has ended, so that the last news still reach the hooks.
         with contextlib.closing(page), contextlib.closing(hooks):
             code = asyncio.run(Daemon(service, endpoint, page, reloading).run())
         last_resort = LastResort(endpoint.remove)
@@ -192,6 +194,7 @@ class Daemon:
             await self._in_device_thread(self._service.shutdown)
         finally:
             patience.cancel()
+            # Only now: until here those who follow the news see how the recording is sealed.
             self._service.news.close()
             self._server.should_exit = True
             try:
@@ -213,6 +216,7 @@ class Daemon:
     async def _command(self, work: Callable[[], None]) -> None:
         if self._ending.is_set():
             raise StateError("the daemon is ending", possible="status")
+        # One more than may wait, since one of them is being carried out.
         if self._waiting > MOST_WAITING:
             raise StateError(f"{MOST_WAITING} commands are waiting already", possible="status")
         self._waiting += 1
@@ -247,6 +251,7 @@ class Daemon:
             self._last_resort.within(END_S)
             return
         log.info("%s: ending", number.name)
+        # The devices have one thread: the shutdown cannot begin before the current command has ended.
         busy = self._service.status().busy is not None
         self._last_resort.within(END_S + (COMMAND_S if busy else 0.0))
         self._exit_code = EXIT_INTERRUPTED if number is signal.SIGINT else 0

@@ -1,6 +1,6 @@
 """The capture service: carries out commands, supervises the capture path, and publishes its status.
 
-One thread calls everything here except `Service.status` and `Service.hurry`, which any thread may call:
+One thread calls everything here except what stands under "any thread" in `Service`, such as its status:
 the device thread publishes an immutable `Status` after every change, and others read the latest.
 """
 
@@ -93,11 +93,13 @@ class Service:
     def status(self) -> Status:
         """Return the latest published status; never waits."""
         uptime_s = round(time.monotonic() - self._born, 3)
+        # These change even while the devices' thread waits for a device and publishes nothing.
         update = {"uptime_s": uptime_s, "troubles": self.troubles.statuses, "disk": self._disk.status}
         return self._status.model_copy(update=update)
 
     def ring_places(self) -> tuple[str | None, dict[str, tuple[str, RingShape]]]:
         """Return the run's ID, and per arm the path and shape of its ring's memory."""
+        # Read once: the devices' thread may set it to None at any moment.
         run = self._run
         return (None, {}) if run is None else (run.run_id, run.capture.ring_places())
 
@@ -130,6 +132,7 @@ class Service:
                 self._capacity = self._prove(force=request.force, progress=self._show)
             run = self._open_run(request)
             run.arm(self._show)
+            # Only now: a run that could not be armed has undone everything itself.
             self._run, self._seen, self._rates = run, CaptureStatus(), Rates()
             self.armed_since = datetime.now(UTC)
             self._order = StandingOrder(self.config)
@@ -185,6 +188,7 @@ class Service:
         self._busy = "capacity"
         self._publish()
         try:
+            # Forced: here an insufficient rate is the answer, and not a refusal.
             self._capacity = self._prove(force=True, fresh=True, progress=self._show)
         finally:
             self._busy = None
@@ -222,6 +226,7 @@ class Service:
         except Exception as error:  # noqa: BLE001 - as above
             self.troubles.note("uploads", error)
         self._disk.check(recording=self._state is State.RECORDING)
+        # While idle nothing is published, but the disk fills, and there may be troubles.
         self.news.update(self.status())
         if self._run is None:
             return
@@ -300,6 +305,7 @@ class Service:
             log.warning("%s continues in %s", before.path, self._seen.path)
         self._salvage.add(self._seen.orphans)
         if self._seen.path is not None:
+            # Without a take, the path is that of a sealed recording, which would return to the journal.
             if self._take is not None:
                 self._salvage.began(Path(self._seen.path))
             self._uploads.add(Path(self._seen.path))
@@ -336,6 +342,7 @@ class Service:
         if take is None and self._order.waits:
             window = self._order.window(note)
             self._begin(Begin(default_path(self.config), self._run.spec(), window=window), by_event=True)
+            # Only now: an event whose recording could not be created leaves the order to the next event.
             self._order.used = True
         elif take is None:
             log.info("the event starts no recording: another did since the instrument was armed")
@@ -353,6 +360,7 @@ class Service:
             self._remember()
         else:
             self._release()
+        # Before the state changes: who waits for "sealed" then sees the result of a recovery, too.
         self._recovered(self._salvage.wait(RECOVERY_S))
         if aborted:
             self._fail(f"the recording was aborted: {self._seen.end_reason}")
@@ -405,6 +413,7 @@ class Service:
     def _remember(self) -> None:
         if self._take is not None:
             self._last, self._take = self._take.result(self._seen), None
+            # Without a condition it was never sealed, and the journal must keep it.
             if self._last.condition is not None:
                 self._salvage.ended(self._last.path)
 
@@ -485,6 +494,7 @@ class Service:
             upload_warning=self._uploads.warning,
         )
         self.news.update(self.status())
+        # Streams send a status whenever they are woken: clients see a new state or step at once.
         before, self._published = self._published, (self._state, self._busy)
         if before != self._published:
             self.news.wake()

@@ -28,6 +28,7 @@ SAMPLE_BYTES = 4 * 2**20
 def storage_settings(config: RigConfig) -> dict[str, Any]:
     """Return the fields of a RecordingSpec that ``[recording]`` determines, except an ``auto`` codec."""
     recording = config.recording
+    # Whole chunks of tags, since a line can be committed only once its tags are on disk, too.
     whole = config.chunk_lines * config.tag_chunks
     return {
         "chunk_lines": config.chunk_lines,

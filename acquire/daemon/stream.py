@@ -64,11 +64,13 @@ class Streams:
             if not loop.is_closed():
                 loop.call_soon_threadsafe(woken.set)
 
+        # Not in `open`: a stream that is never begun would never reach `finally`.
         self._open += 1
         self._log.listen(wake)
         due_s, begins = time.monotonic(), True
         try:
             while not self._log.closed:
+                # Cleared before the look, so that news that come during it wake the stream again.
                 was_woken = woken.is_set()
                 woken.clear()
                 news = self._log.after(last_id)

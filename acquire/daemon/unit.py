@@ -68,11 +68,14 @@ def unit_text(rig: RigConfig, config: Path, *, user: bool, account: str | None =
         f"WatchdogSec={WATCHDOG_S}",
         "Restart=on-failure",
         "RestartSec=1",
+        # SIGTERM goes to the daemon only: to the others it would be an order to end, and they have to
+        # drain and seal the recording first.
         "KillMode=mixed",
         f"TimeoutStopSec={stop_s}",
         f"TimeoutStartSec={STOP_S}",
         *_memory(rig),
         "LimitNOFILE=65536",
+        # For `stream.realtime`; LimitNICE below is for the recorder, which gets more time than others.
         "LimitRTPRIO=1",
         "LimitNICE=-15",
         *(_hardening(recordings, rig) if not user else ["NoNewPrivileges=yes", "UMask=0077"]),

@@ -173,6 +173,7 @@ class Uploads:
             )
         if answer is not None and answer.error is not None:
             self.warning = answer.error.message
+        # A process that is copying may read the query late, and shows that the store answers.
         elif answer is None and not any(one.state == "copying" for one in self._found.values()):
             self.warning = f"{self._target} has not answered for {ANSWER_S:g} s"
         if self.warning is not None:
@@ -180,6 +181,7 @@ class Uploads:
 
     def close(self) -> None:
         """End the process; a later daemon continues. Idempotent."""
+        # Without a target, no further process is started.
         worker, self._worker = self._worker, None
         self._target = None
         if worker is not None:
@@ -253,6 +255,7 @@ class Uploads:
 
     def _query(self) -> Reached | None:
         """Return the store's answer, or None if there is none in time."""
+        # Numbered, since the answer to a query that timed out may still come.
         self._queries += 1
         self._answer = None
         self._post(Reach(self._queries))

@@ -26,6 +26,7 @@ def write_npz(path: Path, content: Content, advance: Callable[[int], object]) ->
     """Write all arrays by name, and ``facts`` as JSON in a text. Raises OSError from the disk."""
     with zipfile.ZipFile(path, "w", zipfile.ZIP_STORED, allowZip64=True) as archive:
         for array in (content.image, *content.columns, *content.beside):
+            # zipfile must know of arrays beyond 2 GiB before the first byte, and does not know their sizes.
             with archive.open(f"{array.name}.npy", "w", force_zip64=True) as file:
                 _write(file, array, advance)
         with archive.open("facts.npy", "w") as file:

@@ -56,6 +56,7 @@ def _bits(text: str) -> NDArray[np.uint8]:
         if not re.fullmatch("0x[0-9a-fA-F]+", text):
             raise UsageError(f"{path} does not hold bits", possible="0 and 1, with or without spaces, or 0x…")
     digits = text[2:]
+    # Bytes take two digits each; the bits of an added one are cut off again.
     padded = digits + "0" * (len(digits) % 2)
     return np.unpackbits(np.frombuffer(bytes.fromhex(padded), np.uint8))[: 4 * len(digits)]
 

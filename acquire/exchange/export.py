@@ -82,6 +82,7 @@ def export(
     """
     check_export(content, path)
     kind, done = format_for(path), 0
+    # Otherwise the progress of formats without these arrays would never be complete.
     written = () if left_out(content, path) else content.beside
     total = sum(array.bytes for array in (content.image, *written))
 

@@ -90,6 +90,7 @@ def _columns(recording: Recording, rows: range) -> Iterator[Array]:
         ("code_index", "code_index", "index of the code's bit in the line's first sub-step"),
         ("code", "code", "the line's code bits, first sub-step in bit 0"),
     )
+    # The code bits of its first line say nothing about a mean.
     for name, column, long_name in tags if rows.step == 1 else tags[:2]:
         yield Array(
             name=name,
@@ -118,6 +119,7 @@ def _steps(recording: Recording, rows: range) -> Iterator[tuple[int, int]]:
 def _of_arms(recording: Recording, rows: range, name: str) -> Iterator[Block]:
     for number, arm in enumerate(ARMS):
         for start, stop in _steps(recording, rows):
+            # More than a block only if a single group is: then it is read in parts.
             if stop - start > _block_lines(recording):
                 values = _long_group(recording, arm, name, start, stop)
                 yield block((number, _place(rows, start, stop)), values)
@@ -139,6 +141,7 @@ def _long_group(recording: Recording, arm: str, name: str, start: int, stop: int
         there += int(seen.sum())
         if name == "lines":
             lines = present_values(recording, arm, name, begin, flags)
+            # Sums of integers are exact in double, so that the parts give the same mean as the whole.
             total = total + lines[seen].sum(axis=0, dtype=np.float64)
     if name == "flags":
         return found & ~np.uint16(NO_IMAGE) if there else found

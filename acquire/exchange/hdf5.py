@@ -43,6 +43,7 @@ def write_hdf5(path: Path, content: Content, advance: Callable[[int], object]) -
 
         with h5py.File(disk, "w") as file:
             _write_entry(file, content, advance_if_written)
+        # Closing has written, too.
         disk.check()
 
 
@@ -101,6 +102,7 @@ def _write_entry(file: Any, content: Content, advance: Callable[[int], object]) 
     entry = _group(file, "entry", "NXentry", default="data")
     entry["title"] = content.title
     data = _group(entry, "data", "NXdata", signal=content.image.name)
+    # In NeXus "." stands for an axis without coordinates.
     data.attrs["axes"] = [axis.name if axis.step else "." for axis in content.axes]
     for number, axis in enumerate(content.axes):
         if axis.step:

@@ -313,6 +313,7 @@ def _write(
     for number, start in enumerate(range(0, lines, BLOCK_LINES)):
         stop = min(lines, start + BLOCK_LINES)
         for arm in ARMS:
+            # The arms in turn, since both have to be on the disk for a commit.
             block = _block(arms.get(arm), arm, spec, start, stop)
             writer.append(tagger.tag(block))
         if number % COMMIT_BLOCKS == 0:

@@ -46,6 +46,7 @@ class Stack:
     def __getitem__(self, index: Any) -> NDArray[Any]:
         """Read the selected pictures. Raises UsageError for more than `MOST_BYTES`."""
         first, *rest = (index if isinstance(index, tuple) else (index,)) or (...,)
+        # A viewer may slice only the last axes: the ellipsis then stands for the pictures, too.
         if first is Ellipsis:
             first, rest = slice(None), [..., *rest]
         numbers = np.arange(self.shape[0])[first]

@@ -13,6 +13,7 @@ def library(module: str, extra: str, what: str) -> Any:
     try:
         return import_module(module)
     except ModuleNotFoundError as error:
+        # The package may be there and lack one that it needs itself: that one is named.
         raise UsageError(
             f"{what} needs the Python package {error.name or module!r}, which is not installed",
             hint=f"pip install 'tdi-acquire[{extra}]'",

@@ -68,6 +68,7 @@ def write_movie(
                 picture = av.VideoFrame.from_ndarray(even, format="gray")
                 container.mux(stream.encode(picture))
             advance(block.nbytes)
+        # Without a frame: what the codec still holds back.
         container.mux(stream.encode())
 
 

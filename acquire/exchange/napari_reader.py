@@ -81,6 +81,7 @@ def _overview(recording: Recording, arm: str, lines: Layer) -> Layer | None:
     _, place, _ = lines
     options = {
         "name": f"{_name(recording)}, arm {arm}, overview ({found.lines_per_row} lines a row)",
+        # Without the axis of the pages, which the overview does not have.
         "translate": place["translate"][1:],
         "contrast_limits": place["contrast_limits"],
         "visible": False,
@@ -93,6 +94,7 @@ def _overview(recording: Recording, arm: str, lines: Layer) -> Layer | None:
 
 def _arm(recording: Recording, arm: str, number: int) -> Layer:
     stack = pages(recording, arm)
+    # `rgb` and `multiscale` are stated, since napari would guess them from the shape.
     options = {
         "name": f"{_name(recording)}, arm {arm}",
         "translate": [0, 0, number * (stack.shape[2] + GAP)],

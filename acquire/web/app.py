@@ -110,6 +110,7 @@ def build_page(
 
     app = new_app(
         "The instrument's page: the daemon's API, recordings, videos and jobs.",
+        # Below /api, where the guard demands a token.
         openapi_url="/api/openapi.json",
         lifespan=lifespan,
     )
@@ -173,6 +174,7 @@ def _add_stream(api: APIRouter, pages: Pages) -> None:
         ] = False,
         once: Annotated[bool, Query(description="only the current state, once, for a hidden page")] = False,
     ) -> Response:
+        # Not a stream: a browser has six connections to a host, and a hidden page must not hold one.
         if once:
             return Response(pages.state, media_type="application/octet-stream", headers=NO_STORE)
         stream = pages.open(pictures=pictures, glimpses=glimpses)

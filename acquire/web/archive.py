@@ -58,7 +58,7 @@ class Archive:
         self._directory = directory
         self._pictures: OrderedDict[tuple[Any, ...], bytes] = OrderedDict()
         self._facts: OrderedDict[tuple[Any, ...], RecordingFacts] = OrderedDict()
-        self._ranges: OrderedDict[str, tuple[float, float]] = OrderedDict()
+        self._ranges: OrderedDict[tuple[str, int], tuple[float, float]] = OrderedDict()
 
     def path_of(self, name: str, suffix: str = ".zarr") -> Path:
         """Return the path of an entry. Raises PlaceError if it is not in the directory, or is a link."""
@@ -130,14 +130,16 @@ class Archive:
         """Return a video with its display range. Raises PlaceError and DataError."""
         path = self.path_of(name)
         video = open_video(path)
-        if name not in self._ranges:
+        # Another video may get the name of one that was removed.
+        key = (name, (path / "zarr.json").stat().st_mtime_ns)
+        if key not in self._ranges:
             # Black and white are the 0.1 % and 99.9 % quantiles of frames over the whole length.
             frames = video.video.shape[0]
             step = max(1, frames // SAMPLED_FRAMES)
             values = np.stack([np.asarray(video.video[k], np.float32) for k in range(0, frames, step)])
             black, white = map(float, np.nanquantile(values, (0.001, 0.999)))
-            _remember(self._ranges, name, (black, white if white > black else black + 1.0), MOST_PICTURES)
-        low, high = self._ranges[name]
+            _remember(self._ranges, key, (black, white if white > black else black + 1.0), MOST_PICTURES)
+        low, high = self._ranges[key]
         return _video_facts(name, video).model_copy(update={"low": low, "high": high})
 
     def frames(self, name: str, first: int, count: int) -> bytes:
@@ -158,6 +160,7 @@ class Archive:
             entries = list(self._directory.iterdir())
         except OSError as error:
             raise PlaceError(f"{self._directory} cannot be listed: {error.strerror}") from error
+        # Links are left out: lstat never reports one as a directory.
         for path in entries:
             try:
                 mode = path.lstat()
@@ -236,6 +239,7 @@ def _arm_overview(opened: Recording, arm: str) -> NDArray[np.uint8]:
     for row in range(rows if opened.lines else 0):
         start = row * opened.lines // rows
         stop = min(opened.lines, start + LINES_PER_ROW)
+        # Dropped by retention, so that nothing of it is on the disk any more.
         if not any(start in rows for rows in kept):
             picture[row] = LOST_COLOUR
             continue

@@ -103,6 +103,7 @@ class Decimator:
         """Return the numbers of a block's lines that are to be sampled."""
         stride = self._scale.stride
         start = max(first_line, self._next_line or first_line)
+        # Multiples of the stride: the choice does not depend on where blocks begin.
         return np.arange(start + -start % stride, first_line + count, stride)
 
     def add(
@@ -122,6 +123,7 @@ class Decimator:
         usable = (flags & NO_IMAGE) == 0
         for start, stop in np.flatnonzero(np.diff(usable, prepend=False, append=False)).reshape(-1, 2):
             begin, end = first_line + int(start), first_line + int(stop)
+            # What waits belongs before the gap: rows are added in order only.
             if self._next_line is not None and begin > self._next_line:
                 self._reduce()
                 self._skip_to(begin, LOST if self._lost else UNSEEN)

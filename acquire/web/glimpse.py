@@ -94,6 +94,7 @@ class Glimpses:
         lines, config = self._sizes.lines, self._config
         first_line = min(peek.newest_line for peek in self._peeks.values()) - lines
         ranges = [peek.stretch(first_line, lines) for peek in self._peeks.values()]
+        # A range is None as well if it was overwritten while it was copied.
         if first_line < 0 or any(each is None for each in ranges):
             return None
         pairs = zip(ranges, self._columns, strict=True)

@@ -66,11 +66,13 @@ class Glimpser:
         reading = asyncio.create_task(self._read(process))
         try:
             while self._watchers and not reading.done():
+                # Nothing is awaited between the count of the watchers and this, so that no change is missed.
                 self._changed.clear()
                 changed = asyncio.create_task(self._changed.wait())
                 await asyncio.wait((changed, reading), return_when=asyncio.FIRST_COMPLETED)
                 changed.cancel()
         finally:
+            # By force: it holds nothing that could be left unfinished, and may be in the middle of a solve.
             reading.cancel()
             with contextlib.suppress(ProcessLookupError):
                 process.kill()

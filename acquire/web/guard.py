@@ -139,6 +139,7 @@ class Guard:
         return self._refusal_of_role(request, address)
 
     def _refusal_of_role(self, request: Request, address: str) -> JSONResponse | None:
+        # Before the token is compared, so that guessing on yields nothing, not even with the right one.
         if not self._wrong.has_room(address):
             return _refuse(429, "too many wrong tokens came from this address", "again in some seconds")
         role = self.role_of(request)
@@ -151,6 +152,7 @@ class Guard:
             return _refuse(
                 403, "a viewer's token cannot change anything", "the operator's token: acquire web --link"
             )
+        # The client passes it to the daemon, which logs it and notes it in the recording.
         WHO.set(f"{role} at {address}"[:LONGEST])
         return None
 

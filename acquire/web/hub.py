@@ -110,6 +110,7 @@ class Hub:
     # ---- the daemon
 
     async def _follow(self, reader: EventReader) -> None:
+        # On every connection, since a daemon that was started anew may have another rig.
         self.setup = await self.client.setup()
         async for item in self.client.follow(reader, history=True, status_s=STATUS_S):
             self._heard_s = time.monotonic()

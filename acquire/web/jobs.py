@@ -76,6 +76,7 @@ class Jobs:
 
     def add(self, request: JobRequest) -> JobFacts:
         """Queue a job. Raises PlaceError if there is no such recording, StateError if the queue is full."""
+        # The name comes from a browser: this refuses one that leads out of the directory.
         self._archive.path_of(request.recording)
         if sum(job.facts.state == "waiting" for job in self._jobs.values()) >= MOST_WAITING:
             raise StateError(f"{MOST_WAITING} jobs are waiting already", hint="stop one of them")
@@ -144,6 +145,7 @@ class Jobs:
                     continue
                 await self._try(job)
         finally:
+            # A step runs beside the queue, and must be given time to leave the instrument as it was.
             if self._step is not None:
                 self._step.cancel()
                 await asyncio.gather(self._step, return_exceptions=True)
@@ -201,11 +203,13 @@ async def _follow_progress(job: _Job) -> None:
     assert job.process.stderr is not None
     with contextlib.suppress(ValueError):  # raised for a line that is too long; the rest is then ignored
         async for line in job.process.stderr:
+            # Once it is being stopped, the text that says so stays.
             if job.ending is None:
                 job.update(**progress_facts(line.decode(errors="replace")))
 
 
 async def _stop_process(job: _Job) -> None:
+    # It was stopped while its process was being started: wait until there is one to signal.
     while job.process is None and job.facts.state == "running":
         await asyncio.sleep(STARTING_S)
     if job.process is not None:

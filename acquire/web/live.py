@@ -83,6 +83,7 @@ class Live:
 
     def _run(self) -> None:
         while not self._ended:
+            # Read before the wait: a change that comes in between has set `_changed`.
             wanted = self._wanted if self._watchers else None
             if wanted is None:
                 self._changed.wait()
@@ -91,6 +92,7 @@ class Live:
             try:
                 self._read(*wanted)
             except AcquireError as error:
+                # It is tried again every second, and logged once.
                 if str(error) != self.error:
                     log.warning("live picture: %s", error)
                 self.error = str(error)

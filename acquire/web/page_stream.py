@@ -44,6 +44,7 @@ class Pages:
 
     async def _stream(self, *, pictures: bool, glimpses: bool) -> AsyncIterator[bytes]:
         hub = self._hub
+        # Not in `open`: a stream that is never begun would never reach `finally`.
         self._open += 1
         woken = hub.listen()
         place = hub.live.watch() if pictures else 0
@@ -53,6 +54,7 @@ class Pages:
             hub.glimpser.watch()
         try:
             while True:
+                # Cleared before the look, so that news that come during it wake the page again.
                 woken.clear()
                 parts: list[bytes] = []
                 next_news, news = hub.news_after(next_news)
@@ -69,6 +71,7 @@ class Pages:
                     parts.append(hub.glimpser.latest)
                 if parts:
                     yield b"".join(parts)
+                # Whatever comes meanwhile is sent in one piece.
                 await asyncio.sleep(LEAST_S)
                 await wait(woken, STATE_S - LEAST_S)
         finally:

@@ -48,6 +48,7 @@ class Passing:
         return await self._client.reload()
 
     async def health(self) -> Health:
+        # Of the status that the hub has anyway, so that pages that ask often cost the daemon nothing.
         return self._hub.health()
 
     async def version(self) -> Version:

@@ -66,6 +66,7 @@ async def _serve(
         lifespan="on",
     )
     settings.load()
+    # After `load`, which would replace it: the context here has its own errors and least version.
     settings.ssl = context
     await uvicorn.Server(settings).serve(sockets=[listener])
 
@@ -79,6 +80,7 @@ class BoundedConnection(Connection):
 def names_of(config: WebConfig) -> frozenset[str]:
     """Return the host names of the page, in lower case."""
     loopback = {"localhost", "127.0.0.1", "::1"} if config.is_loopback else set()
+    # No browser asks for 0.0.0.0: it uses the name of the host.
     anywhere = {sockets.gethostname().lower()} if config.host in ("0.0.0.0", "::") else set()  # noqa: S104
     return frozenset({config.host.lower(), *map(str.lower, config.names), *loopback, *anywhere})
 
@@ -110,6 +112,7 @@ def directory_of(socket: Path) -> Path:
 def _listen(config: WebConfig) -> sockets.socket:
     family = sockets.AF_INET6 if ":" in config.host else sockets.AF_INET
     listener = sockets.socket(family, sockets.SOCK_STREAM)
+    # Otherwise a page that is restarted would have to wait for old connections to time out.
     listener.setsockopt(sockets.SOL_SOCKET, sockets.SO_REUSEADDR, 1)
     try:
         listener.bind((config.host, config.port))

@@ -87,6 +87,7 @@ def _read_tokens(path: Path) -> Tokens:
         ) from error
     with os.fdopen(file, "rb") as source:
         status = os.fstat(file)
+        # Of the open file, and not of its name, which could be replaced in between.
         if not stat.S_ISREG(status.st_mode):
             raise invalid
         if status.st_uid != os.geteuid() or stat.S_IMODE(status.st_mode) & 0o077:

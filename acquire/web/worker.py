@@ -20,6 +20,7 @@ _PR_SET_PDEATHSIG = 1
 
 def main() -> None:
     stand_back(_NICE, FIRST)
+    # The page may be killed, and then nobody else ends its jobs.
     final_signal = signal.SIGINT if sys.argv[1] == "calibrate" else signal.SIGKILL
     ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, final_signal, 0, 0, 0)  # holds beyond execv
     os.execv(sys.executable, [sys.executable, "-m", "acquire", *sys.argv[1:]])  # noqa: S606 - ourselves

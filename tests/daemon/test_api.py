@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import inspect
+import json
 import socket
 import threading
 import time
@@ -21,8 +22,11 @@ from acquire.client import AsyncClient, Client, News, State, core
 from acquire.daemon import stream
 from acquire.daemon.endpoint import Endpoint
 from acquire.daemon.facts import API_VERSION
+from acquire.daemon.messages import error_body
 from acquire.daemon.service import Service
 from acquire.errors import AcquireError, NoDaemonError, StateError, UsageError
+
+EVENTS = b"HTTP/1.1 200 OK\r\nContent-Type: text/event-stream\r\nConnection: close\r\n\r\n"
 
 
 def raw_client(path: Path) -> httpx.Client:
@@ -165,7 +169,9 @@ def test_a_status_comes_with_the_news_and_by_itself(path: Path, daemon: Client) 
     assert kinds[:3] == ["Status"] * 3
 
 
-def _breaking_off(path: Path, ends: list[bytes], late_s: float = 0.0) -> threading.Thread:
+def _breaking_off(
+    path: Path, ends: list[bytes], late_s: float = 0.0, head: bytes = EVENTS
+) -> threading.Thread:
     """A daemon that answers each connection with one of ``ends`` of a stream of events, and hangs up."""
     listener = socket.socket(socket.AF_UNIX)
     listener.bind(str(path))
@@ -177,7 +183,6 @@ def _breaking_off(path: Path, ends: list[bytes], late_s: float = 0.0) -> threadi
             for end in ends:
                 with listener.accept()[0] as connection:
                     connection.recv(1 << 16)
-                    head = b"HTTP/1.1 200 OK\r\nContent-Type: text/event-stream\r\nConnection: close\r\n\r\n"
                     connection.sendall(head)
                     time.sleep(late_s)
                     connection.sendall(end)
@@ -209,6 +214,22 @@ def test_what_is_known_is_told_whole_however_late_the_daemon_is(tmp_path: Path) 
     whole = f"id: a-1\nevent: news\ndata: {news.model_dump_json()}\n\n: alive\n\n".encode()
     server = _breaking_off(tmp_path / "sock", [whole], late_s=0.5)
     assert list(Client(tmp_path / "sock").events(history=True, timeout_s=0)) == [news]
+    server.join(60)
+
+
+@pytest.mark.parametrize("kind", ["blocking", "asynchronous"])
+def test_a_refusal_that_comes_in_parts_is_understood(tmp_path: Path, kind: str) -> None:
+    path = tmp_path / "sock"
+    body = json.dumps(error_body(StateError("16 clients follow the news already"))).encode()
+    head = f"HTTP/1.1 409 Conflict\r\nContent-Length: {len(body)}\r\n\r\n".encode()
+    server = _breaking_off(path, [body[10:]], late_s=0.2, head=head + body[:10])
+
+    async def first() -> News:
+        async with AsyncClient(path) as client:
+            return await anext(aiter(client.events()))
+
+    with pytest.raises(StateError, match="16 clients"):
+        asyncio.run(first()) if kind == "asynchronous" else next(Client(path).events())
     server.join(60)
 
 

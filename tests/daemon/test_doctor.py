@@ -65,6 +65,13 @@ def test_the_disk_is_looked_at(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
     assert "waits for a network" in found(rig_config(tmp_path), "disk").text
 
 
+def test_a_mount_with_a_space_in_its_name_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
+    mounts = "/dev/sda / ext4 rw 0 0\nserver:/x /mnt/lab\\040disk nfs4 rw 0 0"
+    monkeypatch.setattr(doctor, "_read", lambda _: mounts)
+    assert doctor._file_system(Path("/mnt/lab disk/runs")) == "nfs4"
+    assert doctor._file_system(Path("/mnt/lab")) == "ext4"
+
+
 def test_a_port_that_is_taken_and_a_daemon_of_another_version(tmp_path: Path) -> None:
     with socket.socket() as taken:
         taken.bind(("127.0.0.1", 0))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+from collections import deque
 from dataclasses import replace
 from pathlib import Path
 
@@ -153,3 +154,25 @@ def test_a_disk_that_does_not_answer_keeps_nobody_waiting() -> None:
     disk.gone = True
     disk.answers.set()
     until(lambda: disk.watch.status is None, "the error")
+
+
+def test_a_query_that_fails_in_the_middle_of_a_check_does_no_harm() -> None:
+    disk = Disk()
+    disk.check()
+    disk.check()
+    disk.gone = True
+    failing = threading.Thread(target=disk.watch._ask)
+
+    class Looks(deque[tuple[float, int]]):
+        def __len__(self) -> int:
+            count = super().__len__()
+            if failing.ident is None:
+                failing.start()
+                failing.join(0.2)
+            return count
+
+    disk.watch._looks = Looks(disk.watch._looks)
+    disk.watch.check(recording=False)
+    failing.join()
+    disk.watch.close()
+    assert disk.watch.status is None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -9,7 +10,7 @@ import numpy as np
 from acquire.clock import ClockFit
 from acquire.codes import PrbsCode
 from acquire.lines import ARMS, LineBlock, LineFlag
-from acquire.store import RecordingSpec, RecordingWriter, RunCondition, open_recording
+from acquire.store import RecordingSpec, RecordingWriter, RunCondition, open_recording, write_video
 from acquire.stream.tagger import Tagger
 from acquire.trigger.base import TriggerRun
 from acquire.web.archive import LINES_PER_ROW, LOST_COLOUR, PICTURE_ROWS, Archive, _arm_overview
@@ -42,3 +43,13 @@ def test_damaged_and_missing_lines_are_shown_as_lost_and_told(tmp_path: Path) ->
         assert (np.delete(picture, (1, 2), axis=0) == 51).all()
     (listed,) = Archive(tmp_path).recordings()
     assert listed.tainted_by == ["arm b: 7 lines that arrived damaged", "tag mismatches: 2"]
+
+
+def test_a_new_video_under_an_old_name_has_a_range_of_its_own(tmp_path: Path) -> None:
+    archive, path, ranges = Archive(tmp_path), tmp_path / "film.zarr", []
+    for brightest in (1.0, 8.0):
+        frames = np.linspace(0, brightest, 4 * 6 * 6, dtype=np.float32).reshape(4, 6, 6)
+        write_video(path, frames, np.arange(4), pixel_size=1.0, frame_interval_ns=1.0, provenance={})
+        ranges.append(archive.video(path.name).high)
+        shutil.rmtree(path)
+    assert ranges[1] > 7 * (ranges[0] or 0.0) > 6
