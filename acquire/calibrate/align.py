@@ -61,11 +61,13 @@ def align(a: Still, b: Still, geometry: Geometry, start: tuple[float, float] = (
         comparison = _Comparison(images, sigma)
         # Outliers are told by the spread of the differences, which in clean images exceeds the noise by far.
         for loss in ("linear", "soft_l1"):
+            # 0.6745 σ is the median of the absolute values of normal noise
             spread = float(np.median(np.abs(comparison(numbers)))) / 0.6745
             solved = least_squares(
                 comparison,
                 numbers,
                 x_scale=comparison.scale,
+                # scipy's `lm` has no robust loss
                 method="trf",
                 loss=loss,
                 f_scale=max(1.0, spread),
@@ -111,6 +113,7 @@ class _Images:
 
     def __init__(self, a: Still, b: Still, geometry: Geometry) -> None:
         self.geometry = geometry
+        # B sees the scene turned by 90° counter-clockwise
         self.a, self.b = a.image, np.rot90(b.image, -1)
         self.columns, self.rows = a.usable, b.usable
         self.weight = 1 / max(float(np.hypot(a.uncertainty, b.uncertainty)), 1e-12)
@@ -129,7 +132,9 @@ class _Comparison:
         self._n, self._S, self._middle = n, S, (n - 1) / 2
         a, b = images.a, images.b
         if sigma:
+            # S fine pixels are one coarse pixel
             a, b = gaussian_filter(a, (sigma, sigma / S)), gaussian_filter(b, (sigma / S, sigma))
+        # once for all evaluations, which then interpolate without a filter
         self._a, self._b = spline_filter(a, mode="nearest"), spline_filter(b, mode="nearest")
         coarse = S * np.arange(geometry.stages) + (S - 1) / 2
         self._b_rows, self._a_columns = np.meshgrid(coarse, coarse, indexing="ij")
@@ -141,6 +146,7 @@ class _Comparison:
 
     def __call__(self, numbers: NDArray[np.float64]) -> NDArray[np.float64]:
         a, b, inside = self._pairs(numbers)
+        # 0 outside, because `least_squares` needs the same number of residuals in every call
         residual = np.where(inside, b - numbers[4] * a - numbers[5], 0.0)[self._good]
         weighted: NDArray[np.float64] = residual * self._images.weight
         return weighted
@@ -178,6 +184,7 @@ class _Comparison:
         p = (y - e * x) / d
         q = f * p + g * x + alignment.columns
         at_a_row, at_b_column = p + self._middle, q + self._middle
+        # row m of an image is the sum over S fine rows up to m, and is centred (S − 1)/2 before it
         half = (self._S - 1) / 2
         rows_a = at_a_row + half
         columns_a = (self._a_columns - half) / self._S

@@ -56,6 +56,7 @@ def check_fits(calibration: Calibration, recording: Recording) -> tuple[str, ...
             f"{theirs.substep_s:.3g} s: dark current and ambient light differ"
         )
     made = [datetime.fromisoformat(step["made"]) for step in calibration.steps.values() if "made" in step]
+    # retention may have deleted the first lines
     row = recording.first_available_line - recording.first_line if recording.lines else 0
     if made and row < recording.lines:
         begun = datetime.fromtimestamp(int(recording.arms["a"].read("time", row, row + 1)[0]) * 1e-9, UTC)
@@ -83,6 +84,7 @@ def calibrated(segment: Segment, calibration: Calibration) -> Segment:
     calibration = _of_columns(calibration, segment)
     black, curve = black_level(segment, calibration), curve_of(calibration)
     if curve is not None:
+        # samples are linearised before anything is subtracted, so that their black level has to be, too
         black = curve.straight(_columns(segment.black_level_dn, segment) if black is None else black)
     gain, balance = calibration.value("gain"), calibration.value("balance")
     responsivity = None
@@ -102,10 +104,12 @@ def calibrated(segment: Segment, calibration: Calibration) -> Segment:
         changes["balanced"] = True
     if calibration.usable is not None and not calibration.usable.all():
         changes["mask"] = segment.mask & calibration.usable[:, None, :]
+    # what belongs to the cameras comes before the orientation, which may swap the arms
     corrected = replace(segment, **changes)
     if calibration.orientation is not None:
         corrected = oriented(corrected, view_named(calibration.orientation))
     if calibration.alignment is not None:
+        # measured between the arms as they are turned by then
         corrected = replace(corrected, alignment=calibration.alignment.alignment)
     return _without_interpolation(corrected)
 
@@ -192,4 +196,5 @@ def _columns(value: Any, segment: Segment) -> NDArray[np.float64]:
     """Expand a number, one per arm, or one per arm and column to (arm, column)."""
     given = np.asarray(value, np.float64)
     given = given if given.ndim == 2 else given.reshape(-1, 1)
+    # a copy, because broadcast arrays cannot be written to
     return np.broadcast_to(given, (len(segment.lines), segment.geometry.stages)).copy()

@@ -235,6 +235,7 @@ class Calibration:
         return replace(
             self,
             quantities={**self.quantities, **found.quantities},
+            # from all steps anew: a step that is repeated can make columns usable again
             usable=_usable(steps, self.instrument.columns),
             orientation=found.orientation or self.orientation,
             alignment=found.alignment or self.alignment,
@@ -367,6 +368,7 @@ def differences_between(known: Instrument, other: Instrument) -> list[str]:
         found += [
             f"camera {arm}: {key} is {theirs[key]} instead of {mine[key]}"
             for key in mine
+            # cameras differ in the settings that they report
             if key in theirs and mine[key] != theirs[key]
         ]
     return found

@@ -81,6 +81,7 @@ def check(exposure: Exposure, known: Calibration, *, covered: bool = False) -> C
         found = flat(exposure, known)
         corrected = found
         if known.alignment is not None:
+            # as `align` corrected the calibration's own flat
             quantities = without_field_edge(known.with_step(found), known.alignment.alignment)
             corrected = replace(found, quantities={**found.quantities, **quantities})
         return Check((*_columns(corrected, known, "gain", "1"), *_balance(found, known)), doubts)
@@ -113,6 +114,7 @@ def _columns(found: Finding, known: Calibration, name: str, unit: str) -> Iterat
         good &= known.usable
     change: NDArray[np.float64] = np.where(good, now.value - before.value, 0.0)
     sure = np.hypot(now.uncertainty, before.uncertainty)
+    # the most significant change, which need not be the largest
     at = np.unravel_index((np.abs(change) - SURE * sure).argmax(), change.shape)
     yield Compared(name, unit, float(change[at]), float(sure[at]), MATTERS[name])
 

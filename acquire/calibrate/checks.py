@@ -59,6 +59,7 @@ def refuse_clipped(exposure: Exposure, found: Moments) -> None:
 
 def refuse_level(exposure: Exposure, found: Moments, light: NDArray[np.float64]) -> None:
     """Raise UsageError for a flat that is saturated, or too dark; ``light`` (arm, column) in DN."""
+    # by the median, so that a few hot columns do not refuse a flat
     saturated = np.median(found.saturated, axis=1).max()
     if saturated > MOST_SATURATED:
         raise UsageError(

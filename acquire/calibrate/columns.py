@@ -66,8 +66,10 @@ def dark(exposure: Exposure, *, covered: bool = False, progress: Progress = no_p
     size = np.log(np.maximum(noise, 1e-6))
     middle = np.median(size, axis=1, keepdims=True)
     spread = np.median(np.abs(size - middle), axis=1, keepdims=True)
+    # where all columns are alike, up to three times their noise is still usable
     usable: NDArray[np.bool_] = size - middle <= np.maximum(NOISY * spread, np.log(3.0))
     quantities = {
+        # readings that never change are still uncertain by their rounding
         "offset_dn": Measured(found.mean, np.sqrt(np.maximum(found.variance, QUANTISATION_DN2) / lines)),
         # The standard error of a standard deviation of n values is σ/√(2n).
         "noise_dn": Measured(noise, noise / np.sqrt(2 * lines)),
@@ -134,6 +136,7 @@ def flat(
     balance = arms / arms.mean()
     quantities = {
         "gain": Measured(gain, np.where(trusted, relative, 0.05)),
+        # a/((a + b)/2) changes by half of the relative change of either arm
         "balance": Measured(balance, balance * np.hypot(*arm_error) / 2),
     }
     facts = {
@@ -164,6 +167,7 @@ def dark_edges(shape: NDArray[np.float64], usable: NDArray[np.bool_]) -> NDArray
         spread = 1.4826 * np.median(np.abs(row[good] - middle))
         low = row < middle - np.maximum(DARK_EDGE * spread, 2e-3 * middle)
         for order in (slice(None, most), slice(None, -most - 1, -1)):
+            # from the edge inwards, up to the first column that is bright
             out[order] = np.logical_and.accumulate(low[order])
     return dark | _blurred_edges(shape, usable, dark)
 
@@ -204,6 +208,7 @@ def _profile(response: NDArray[np.float64], usable: NDArray[np.bool_]) -> NDArra
     x = np.linspace(-1, 1, response.shape[1])
     inner = usable & ~dark_edges(response, usable)
     fits = [
+        # over the domain of all columns, whichever are fitted
         np.polynomial.chebyshev.Chebyshev.fit(x[good], row[good], min(SMOOTH_DEGREE, good.sum() - 1), [-1, 1])
         for row, good in zip(response, inner, strict=True)
     ]

@@ -137,10 +137,13 @@ def _whole_substeps(
     bits = code.bits(first - reach, int(starts[-1]) + width + 2 * reach).astype(np.float64)
     view = np.lib.stride_tricks.sliding_window_view(bits, width + 2 * reach)
     along = np.zeros(width + 2 * reach)
+    # block by block, because indexing copies a window for every line
     for at in range(0, len(y), BLOCK):
+        # bits as ±½, so that chance correlations have mean 0
         along += y[at : at + BLOCK] @ (view[starts[at : at + BLOCK]] - 0.5)
     sums = np.convolve(along, np.ones(width), "valid")
     best = int(sums.argmax())
+    # standard deviation of a sum of N·width products of noise with ±½
     chance = 0.5 * float(y.std()) * (len(y) * width) ** 0.5
     if sums[best] < CERTAIN * chance:
         raise UsageError(
@@ -178,10 +181,13 @@ def _contributions(
 def _ends(parts: NDArray[np.float64], errors: NDArray[np.float64], whole: int, geometry: Geometry) -> Beyond:
     """Place the line's own sub-steps where they leave least outside, and return the contributions there."""
     width = geometry.size + geometry.substeps - 1
+    # every row is in S of the contributions
     row = float(parts.sum() / (geometry.size * geometry.substeps))
     outside = np.abs(parts).sum() - np.convolve(np.abs(parts), np.ones(width), "valid")
+    # away from the ends, because one contribution on either side is needed
     at = 1 + int(outside[1:-1].argmin())
     first, last = parts[at : at + geometry.substeps], parts[at + width - geometry.substeps : at + width]
+    # the first S contributions are those of 1, 2, … S rows: S·(S + 1)/2 in all
     if min(first.sum(), last.sum()) < LIT * row * geometry.substeps * (geometry.substeps + 1) / 2:
         raise UsageError(
             "the scene is dark at the sensor's first or last rows, where delays show",

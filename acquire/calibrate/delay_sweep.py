@@ -81,6 +81,7 @@ class Setting:
                 excess = min(0, math.floor(substeps - side))
             around.append(each - excess * self.substep_ticks)
         found = [self.delays([each - share * self.substep_ticks for each in around]) for share in SHARES]
+        # within the trigger's limits some settings are the same
         return list(dict.fromkeys(found))
 
     def whole_substeps(self, late: NDArray[np.float64]) -> int:
@@ -208,6 +209,7 @@ def _crossing(points: Sequence[Point], arm: int, substep_ticks: int) -> Crossing
         )
     model = _Model(later, seen, sight, substep_ticks)
     sharp = model.fit(rounded=False)
+    # rounded edges show only as a difference between the two sides
     if (later < sight).all() or (later > sight).all():
         return Crossing(*sharp[:2], 0.0)
     rounded = model.fit(rounded=True)
@@ -228,6 +230,7 @@ class _Model:
         self._later, self._sight, self._ticks = later, sight, substep_ticks
         self._parts = np.array([[each.before, each.first, each.last, each.after] for each in seen])
         self._errors = np.array([each.error for each in seen])
+        # decided once, so that no recording changes sides during a fit
         self._is_late = later < sight
 
     def fit(self, *, rounded: bool) -> tuple[float, float, float, float]:

@@ -185,6 +185,7 @@ def moments(exposure: Exposure, progress: Progress = no_progress) -> Moments:
         done += samples.shape[1]
         progress(done, exposure.lines)
     counts, means, variances, own, zeros, saturated = (np.stack(each) for each in zip(*parts, strict=True))
+    # lost lines are left out, so that the arms may differ
     total = counts.sum(axis=0)
     if not total.all():
         raise UsageError(f"{exposure.recording}: an arm has no line that arrived", hint="other lines")

@@ -54,10 +54,12 @@ def without_field_edge(known: Calibration, alignment: Alignment) -> dict[str, Me
     arm, name = (0, "a") if view.swapped else (1, "b")
     lit = profile(alignment, known.instrument.stages, known.instrument.substeps)
     if view.mirrored and not view.swapped:
+        # in the order of the camera's own columns
         lit = lit[::-1]
     gain, balance = known.quantities["gain"], known.quantities["balance"]
     hidden = {int(column): value for column, value in step["edge_response"].get(name, {}).items()}
     response = gain.value[arm].copy()
+    # `flat` has set these gains to 1; here their response counts
     response[list(hidden)] = list(hidden.values())
     witnesses = lit < 1 - TELLS
     ending, unlimited = (float(((response - each)[witnesses] ** 2).sum()) for each in (lit, 1.0))
@@ -68,6 +70,7 @@ def without_field_edge(known: Calibration, alignment: Alignment) -> dict[str, Me
     own = gain.value[arm, corrected] / lit[corrected]
     gains, arms = gain.value.copy(), balance.value.copy()
     gains[arm, corrected] = own / own.mean()
+    # gains keep a mean of 1, and the balance takes their level
     arms[arm] *= own.mean()
     return {
         "gain": Measured(gains, gain.uncertainty),

@@ -46,12 +46,14 @@ def save_calibration(place: Path | str, calibration: Calibration) -> None:
         _deliver(delivery_to(place), place, calibration)
         return
     path = Path(place)
+    # only a calibration is replaced: anything else raises here
     open_calibration(path)
     fresh = path.with_name(f".{path.name}.{os.getpid()}.new.zarr")
     shutil.rmtree(fresh, ignore_errors=True)
     _deliver(delivery_to(fresh), fresh, calibration)
     before = path.with_name(f".{path.name}.{os.getpid()}.before")
     with refused(path, "written"):
+        # the old one remains on the disk until the new one is in its place
         path.rename(before)
         fresh.rename(path)
         shutil.rmtree(before)

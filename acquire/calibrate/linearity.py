@@ -122,6 +122,7 @@ def linearity(
     knots = knots_dn(known.instrument)
     excess, doubt = [], []
     for bend, dn, row, good in zip(bends, knots, offset, usable, strict=True):
+        # one curve for all columns of an arm, and thus from their mean black level
         found = bend.excess(dn - row[good].mean())
         excess.append(found[0])
         doubt.append(found[1])
@@ -158,6 +159,7 @@ def level_ticks(dimmest: Exposure, offset: NDArray[np.float64]) -> list[int]:
     light = (moments(dimmest).mean - offset).mean(axis=1)
     room = float((dimmest.camera("white_dn") - offset.mean(axis=1)).min())
     most = min(whole - lit, round(lit * room / max(float(light.max()), LOWEST_LIGHT_DN)))
+    # without the dimmest, which is recorded already
     levels = sorted({round(each) for each in np.linspace(lit, max(most, lit), PARTS - 1)} - {lit})
     return levels[::2] + levels[1::2][::-1]
 
@@ -183,6 +185,7 @@ def deviations(ramp: Ramp, light_dn: NDArray[np.float64]) -> tuple[float, float]
             possible=f"{FEWEST_BETWEEN} or more",
             hint="more light, or more levels",
         )
+    # divided by the levels, so that the squares are those of relative deviations
     design = np.stack([np.ones_like(H), H], axis=1) / y[:, None]
     line = np.linalg.lstsq(design, np.ones_like(y), rcond=None)[0]
     deviation = y / (line[0] + line[1] * H) - 1
@@ -213,6 +216,7 @@ def _ramps(
             light, variance = (found.mean - offset)[i, good], found.own_variance[i, good]
             if found.saturated[i, good].mean() > MOST_SATURATED:
                 break
+            # full pixels have hardly any shot noise
             if kept and variance.mean() < FALLEN * kept[-1][3]:
                 full = float(kept[-1][1].mean())
                 break
@@ -246,6 +250,7 @@ def _fitted(ramp: Ramp, count: int) -> tuple[Bend, float]:
     """Fit ``count`` powers; return them and the residual of the levels' means, in squares of their σ."""
     top = float(ramp.level_dn.max())
     root = np.sqrt(ramp.weight)[:, None]
+    # orthonormal basis of the weighted straight lines: `from_line` is what they leave over
     line = np.linalg.qr(root * np.stack([np.ones_like(ramp.ticks), ramp.ticks], axis=1))[0]
 
     def from_line(values: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -110,6 +110,7 @@ def _whitened(image: NDArray[Any]) -> NDArray[np.float64]:
     from scipy.ndimage import gaussian_filter
 
     rough: NDArray[np.float64] = image - gaussian_filter(image.astype(np.float64), 4.0, mode="nearest")
+    # without the window's zeros at either end
     window = np.hanning(len(image) + 2)[1:-1]
     flat: NDArray[np.float64] = (rough - rough.mean()) * np.sqrt(np.outer(window, window))
     return flat / max(float(np.linalg.norm(flat)), 1e-30)
@@ -117,6 +118,7 @@ def _whitened(image: NDArray[Any]) -> NDArray[np.float64]:
 
 def _peak(a: NDArray[np.float64], b: NDArray[np.float64]) -> tuple[float, tuple[float, float]]:
     """Return the largest normalised cross-correlation, and the shift of ``b`` relative to ``a``."""
+    # padded to twice the size, so that shifted images do not wrap around
     size = 2 * len(a)
     product = np.conj(np.fft.rfft2(a, (size, size))) * np.fft.rfft2(b, (size, size))
     found = np.fft.irfft2(product, (size, size))

@@ -90,6 +90,7 @@ def psf(exposure: Exposure, known: Calibration) -> Finding:
             possible="a pseudo-random code: code.kind = 'prbs'",
         )
     lines = min(exposure.lines, MOST_LINES)
+    # the images of the cameras themselves, in their own rows and columns
     plain = without_blur(replace(known, orientation=None, alignment=None))
     segment = calibrated(replace(exposure, lines=lines).whole(), plain)
     S = segment.geometry.substeps
@@ -178,6 +179,7 @@ def straight_edges(still: Still, substeps: int, arm: str) -> list[Edge]:
     """
     S, image = substeps, still.image
     high, wide = WINDOW * S, WINDOW
+    # the first and last rows of an image are sums over fewer than S rows of the scene
     rows = np.arange(S, image.shape[0] - high - S + 1, high // OVERLAP)
     columns = np.arange(1, image.shape[1] - wide, wide // OVERLAP)
     places = [(r, c) for r in rows for c in columns if still.usable[c : c + wide].all()]
@@ -198,6 +200,7 @@ def straight_edges(still: Still, substeps: int, arm: str) -> list[Edge]:
 def _fitted(window: NDArray[np.float64], S: int, noise: float) -> Edge | None:
     """Fit the edge of a window; None if the window contains something else."""
     rows, columns = np.indices(window.shape, np.float64)
+    # both in fine pixels
     y, x = rows - rows.mean(), S * (columns - columns.mean())
     low, high = np.quantile(window, (0.1, 0.9))
     # Start from the direction of a fitted plane, and from the distance that splits off the bright share.
@@ -242,6 +245,7 @@ def _edge(
     distance: NDArray[np.float64], sigma: float, S: int, normal: tuple[float, float]
 ) -> NDArray[np.float64]:
     """Return a step from 0 to 1, blurred and summed over a pixel, at ``distance`` behind the edge."""
+    # not 0, by which the result is divided
     wide, narrow = (max(S * abs(each), 0.02) for each in normal)
 
     def twice(at: NDArray[Any]) -> NDArray[Any]:
@@ -250,6 +254,7 @@ def _edge(
         density = np.exp(-0.5 * scaled**2) / np.sqrt(2 * np.pi)
         return np.asarray(((at**2 + sigma**2) * ndtr(scaled) + at * sigma * density) / 2)
 
+    # a convolution with two boxes is a second difference of the second integral
     far, near = (wide + narrow) / 2, (wide - narrow) / 2
     summed = twice(distance + far) - twice(distance + near) - twice(distance - near) + twice(distance - far)
     return np.asarray(summed / (wide * narrow))

@@ -67,6 +67,7 @@ def _still(
 ) -> Still:
     share = mask.mean(axis=0)
     usable = share > 0.5 * share.max()
+    # complete lines, so that one factorisation serves all columns
     lines = mask[:, usable].all(axis=1) if usable.any() else np.zeros(len(mask), np.bool_)
     needed = int(np.ceil(SPARE * windows.shape[1]))
     if lines.sum() < needed:
@@ -87,6 +88,7 @@ def _still(
         ) from error
     image = cho_solve(factor, A.T @ y)
     residual = y - A @ image
+    # degrees of freedom of each column
     spare = lines.sum() - windows.shape[1]
     noise = float(np.sqrt((residual**2).sum() / (spare * max(usable.sum(), 1))))
     inverse = cho_solve(factor, np.eye(windows.shape[1]))

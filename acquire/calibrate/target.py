@@ -88,6 +88,7 @@ def alignment(exposure: Exposure, known: Calibration) -> Finding:
     geometry, S = segment.geometry, segment.geometry.substeps
     still_a, still_b = stills(segment)
     view, facts = clearest_view(still_a, still_b, S)
+    # `_segment` has corrected the known orientation, which leaves the model's
     if view is not None and view != MODEL:
         expected = MODEL.name if known.orientation is None else known.orientation
         raise UsageError(
@@ -95,6 +96,7 @@ def alignment(exposure: Exposure, known: Calibration) -> Finding:
             hint="run acquire calibrate orientation with the same recording",
         )
     shift = correlations(still_a.blocks(S), still_b.blocks(S))[MODEL][1]
+    # the shift is in blocks of S fine pixels
     match = align(still_a, still_b, geometry, (S * shift[0], S * shift[1]))
     quantities = without_field_edge(known, match.found.alignment)
     ends = bool(quantities)
@@ -168,6 +170,7 @@ def _balance(known: Calibration, match: Match) -> dict[str, Measured]:
     before = known.value("balance")
     before = np.ones(2) if before is None else before
     swapped = known.orientation is not None and view_named(known.orientation).swapped
+    # if the arms are swapped, the model's arm B is camera A
     ratio = before[1] / before[0] * (1 / match.brightness if swapped else match.brightness)
     balance = np.array([2 / (1 + ratio), 2 * ratio / (1 + ratio)])
     return {"balance": Measured(balance, BALANCE_ERROR * balance)}

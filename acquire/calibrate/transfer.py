@@ -112,6 +112,7 @@ def _slope(points: list[Point], arm: str) -> tuple[float, float, float]:
             f"arm {arm} has no level between {LOWEST_LIGHT_DN:g} DN and where pixels are full",
             hint="record flats at 10 to 90 % of white",
         )
+    # the error of variance/light is error/light
     weights = np.array([(point.light / point.error) ** 2 for point in kept])
     slopes = np.array([point.variance / point.light for point in kept])
     K, error = float((weights * slopes).sum() / weights.sum()), float(weights.sum() ** -0.5)

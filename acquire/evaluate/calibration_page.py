@@ -45,6 +45,7 @@ def write_page(known: Calibration, directory: Path, name: str, facts: Mapping[st
         }
     text = json.dumps(known.to_attrs(), indent=1, allow_nan=False, ensure_ascii=False)
     (directory / "calibration.json").write_text(text + "\n", encoding="utf-8")
+    # steps have a table of their own
     shown = {key: value for key, value in facts.items() if value is not None and key not in known.steps}
     steps = [{"name": step, **about} for step, about in known.steps.items()]
     page = directory / "index.html"
@@ -76,6 +77,7 @@ def _panel(ax: Axes, known: Calibration, key: str) -> None:
     usable = np.ones(measured.value.shape, np.bool_) if known.usable is None else known.usable
     hidden = known.steps.get("flat", {}).get("optics_hide_columns", {}) if key == "gain" else {}
     x = np.arange(measured.value.shape[1])
+    # there are more colours than arms
     for arm, value, error, good, colour in zip(
         ARMS, measured.value, measured.uncertainty, usable, SOLVER_COLOURS, strict=False
     ):
@@ -120,6 +122,7 @@ def _field(known: Calibration) -> Figure | None:
         points[0],
         factor * displacement[1],
         factor * displacement[0],
+        # arrows in units of the axes, enlarged by `factor` and by nothing else
         angles="xy",
         scale_units="xy",
         scale=1,
@@ -132,6 +135,7 @@ def _field(known: Calibration) -> Figure | None:
         xlabel="column (fine pixels from the centre)",
         ylabel="row (downwards)",
         xlim=(-1.15 * half, 1.15 * half),
+        # rows count downwards
         ylim=(1.15 * half, -1.15 * half),
     )
     drawn = "" if factor == 1 else f",\nenlarged {factor} times"

@@ -170,6 +170,7 @@ def compare_curve(
             f"a curve {measured.shape} cannot be compared with a theory {theory.shape}",
             possible="curves of the same length",
         )
+    # theory decides whether a curve changes: noise alone always fits some sinusoid
     theory_fit = fit_sine(theory, interval_s, harmonics=harmonics)
     check_finite(measured, "the measured curve")
     return CurveComparison(

@@ -69,6 +69,7 @@ def line_streams(result: DemoResult) -> Figure:
     usable = segment.lines[segment.mask]
     low, high = (float(usable.min()), float(usable.max())) if usable.size else (0.0, 1.0)
     half = np.diff(times).mean() / 2 if len(times) > 1 else 0.5
+    # samples are centred on their pixel and their time
     extent = (-0.5, segment.geometry.stages - 0.5, times[-1] + half, times[0] - half)
     colours = mpl.colormaps["gray"].with_extremes(bad=MASKED)
     for arm, ax in enumerate(axes):
@@ -104,6 +105,7 @@ def frames(result: DemoResult) -> Figure:
     for frame, ax in zip(picks, axes[0], strict=True):
         stamp(ax, f"#{frame}\n{result.frame_ms[frame]:.2f} ms")
     _colour_bar(figure, axes[0], "intensity", "neither")
+    # the third row is the error of the first solver
     _colour_bar(figure, axes[2], "|error|", "max")
     return figure
 

@@ -67,6 +67,7 @@ def band(runs: Sequence[Run], name: str, clock: Clock = "seconds") -> Band | Non
     begin = max(each[0, 0] for each in stairs)
     times_s = np.unique(np.concatenate([[begin], *(each[:, 0] for each in stairs)]))
     times_s = times_s[times_s >= begin]
+    # as in `Band.at`
     places = [np.searchsorted(each[:, 0], times_s * (1 + 1e-9), "right") - 1 for each in stairs]
     values = np.array([each[place, 1] for each, place in zip(stairs, places, strict=True)])
     return Band(times_s, values.min(axis=0), np.median(values, axis=0), values.max(axis=0))

@@ -118,6 +118,7 @@ def _local_mean(image: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _ssim_frame(video: NDArray[Any], truth: NDArray[Any], data_range: float) -> float:
+    # in units of the range, so that c1 and c2 need no factor, and no square overflows
     x, y = video.astype(np.float64) / data_range, truth.astype(np.float64) / data_range
     c1, c2 = SSIM_K1**2, SSIM_K2**2
     mx, my = _local_mean(x), _local_mean(y)

@@ -21,6 +21,7 @@ def fill_template(template: str, facts: Mapping[str, Any], drawings: Mapping[str
     environment = jinja2.Environment(
         loader=jinja2.PackageLoader("acquire.evaluate"),
         autoescape=True,
+        # a misspelt fact is an error, not a blank
         undefined=jinja2.StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,

@@ -79,6 +79,7 @@ def common_times(panels: Sequence[Panel], count: int) -> NDArray[np.int64]:
     """
     finest = min(panels, key=lambda panel: panel.file.interval_ns).file.time_ns
     begin = max(int(panel.file.time_ns[0]) for panel in panels)
+    # the last frame is shown for as long as the others
     end = min(panel.file.time_ns[-1] + panel.file.interval_ns for panel in panels)
     times = finest[(finest >= begin) & (finest < end)]
     if not len(times):
@@ -165,6 +166,7 @@ def _peak(panel: Panel) -> float:
     frames = panel.file.video.shape[0]
     some = np.unique(np.linspace(0, frames - 1, 12).astype(int))
     values = np.stack([np.asarray(panel.file.video[int(index)]) for index in some])
+    # a dark video has no peak to divide by
     return float(np.quantile(values, PEAK_QUANTILE)) or 1.0
 
 
@@ -192,10 +194,12 @@ def _write_mp4(path: Path, pictures: Iterator[Image.Image], fps: float) -> None:
 
     first = next(pictures)
     with av.open(str(path), "w") as container:
+        # the codec's clock needs a fraction with small terms
         stream = container.add_stream("libx264", rate=Fraction(fps).limit_denominator(1000))
         stream.pix_fmt, stream.options = "yuv420p", {"crf": "18"}
         # the codec halves the resolution of colours, so it needs even sizes
         stream.width, stream.height = (side - side % 2 for side in first.size)
         for picture in chain([first], pictures):
             container.mux(stream.encode(av.VideoFrame.from_ndarray(np.asarray(picture))))
+        # the encoder still holds frames back
         container.mux(stream.encode())

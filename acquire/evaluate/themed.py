@@ -95,6 +95,7 @@ def save_drawing(
     narrow_in: float | None = None,
 ) -> Drawing:
     """Write ``NAME.png`` and ``NAME.svg``; return the drawing to embed in a page, as `drawing_of`."""
+    # the PNG first, because `drawing_of` may give the figure another shape
     figure.savefig(directory / f"{name}.png", dpi=DPI)
     drawing = drawing_of(figure, narrow=narrow, narrow_in=narrow_in)
     (directory / f"{name}.svg").write_text(drawing.svg, encoding="utf-8")
@@ -119,6 +120,7 @@ def drawing_of(figure: Figure, *, narrow: Figure | None = None, narrow_in: float
 def _svg(figure: Figure) -> str:
     file = StringIO()
     with mpl.rc_context(SVG):
+        # without a date, so that the same figure gives the same file
         figure.savefig(file, format="svg", transparent=True, metadata={"Date": None})
     # Round the paths to 0.01 pt.
     svg = re.sub(r' d="[^"]*"', lambda path: re.sub(r"(\.\d\d)\d+", r"\1", path[0]), file.getvalue())

@@ -152,6 +152,7 @@ class Judge:
     def judged(self, point: Point, video: NDArray[Any], voxels: Voxels) -> Point:
         """Return ``point`` with the accuracy of its video."""
         shown, true = video[self.frames(voxels)], self.truth(voxels)
+        # a copy, because a view would keep the whole video of every point
         point = replace(point, frame=np.array(shown[self.picked(voxels)], np.float32))
         if true is None:
             return point
@@ -192,6 +193,7 @@ class Judge:
         interval_s = self.segment.substep_ns * voxels.temporal_merge * 1e-9
         errors = []
         for led, mask in zip(self.scene.leds, masks, strict=True):
+            # below the Nyquist frequency of the frames
             visible = isinstance(led.drive, SineDrive) and 2 * led.drive.frequency_hz * interval_s < 1
             if not visible or not mask.any() or len(shown) < 16:
                 continue
@@ -225,6 +227,7 @@ def measure(
 
     The run is cut after ``longest_s``. Raises UsageError for a dark scene.
     """
+    # first, because a reconstruction may take minutes
     judge.check(voxels)
     points: list[Point] = []
 
@@ -282,6 +285,7 @@ def table(runs: Sequence[Run]) -> list[dict[str, Any]]:
     """Return every observed result as a flat row."""
     kinds = dict.fromkeys((run.case, run.voxels) for run in runs)
     fronts = {
+        # by identity, because points of two runs may be equal
         id(point)
         for kind in kinds
         for _, point in pareto(run for run in runs if (run.case, run.voxels) == kind)

@@ -103,6 +103,7 @@ def _curve(ax: Axes, repeats: list[Run], metric: Metric, clock: Clock, colour: s
     low, middle, high = (_shown(values, metric) for values in (found.low, found.middle, found.high))
     run = repeats[0]
     ax.fill_between(found.times_s, low, high, color=colour, alpha=0.2, lw=0)
+    # float64 has thin lines and hollow markers
     exact = run.dtype != "float32"
     ax.plot(
         found.times_s, middle, LINES.get(run.preset, "-"), color=colour, lw=1.0 if exact else 1.8, zorder=3

@@ -72,6 +72,7 @@ def write_page(
     movies = []
     for number, (case, voxels) in enumerate(dict.fromkeys((run.case, run.voxels) for run in runs)):
         own = [run for run in runs if (run.case, run.voxels) == (case, voxels)]
+        # `truths` are those of the first repeat: every other one has another draw of the scene
         shown = max((run for run in own if run.repeat == 0), key=lambda run: run.end.psnr_db or 0.0)
         truth = truths.get((case, voxels))
         drawn = _draw(own, shown, truth, f"case-{number}")
@@ -93,6 +94,7 @@ def write_page(
         )
     text = json.dumps(facts, indent=1, allow_nan=False, ensure_ascii=False)
     (directory / "tradeoff.json").write_text(text + "\n", encoding="utf-8")
+    # the csv writer ends its lines itself
     with (directory / "tradeoff.csv").open("w", newline="", encoding="utf-8") as file:
         writer = csv.DictWriter(file, fieldnames=list(rows[0]))
         writer.writeheader()
@@ -170,6 +172,7 @@ def _effects(study: Study) -> Figure:
     figure = canvas(3.4)
     ax = figure.subplots()
     known = [worth for worth in study.effects if worth.noises is not None]
+    # logarithmic axes have no 0
     costs = [max(worth.us_per_line, 1e-3) for worth in known]
     sizes = [max(worth.noises or 0.0, 1e-4) for worth in known]
     ax.plot(costs, sizes, "o", color=SOLVER_COLOURS[0], ms=7)

@@ -45,6 +45,7 @@ def write_page(
     height = min(look.panel_px, max(panel.file.video.shape[1] for panel in panels))
     pictures = []
     for number, time_ns in enumerate(times.tolist()):
+        # each video has its own white
         frames = [panel.at(time_ns) / peak for panel, peak in zip(panels, peaks, strict=True)]
         pictures.append(beside(frames, 1.0, height))
         if progress is not None:

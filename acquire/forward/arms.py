@@ -66,6 +66,7 @@ class DualArm:
     def forward(self, video: NDArray[Any]) -> NDArray[Any]:
         """Λ′·X′: (⌈T/T_m⌉, ⌈n/N_m⌉, ⌈n/N_m⌉) → (2, L_R, M)."""
         video = self._checked(video, self.video_shape, "video")
+        # registration first, then blur: each arm blurs the view that it gets; `adjoint` goes back in reverse
         view_b = video if self._registration is None else self._registration.forward(video)
         if self._blurring is not None:
             video, view_b = self._blurring.forward(0, video), self._blurring.forward(1, view_b)
@@ -106,6 +107,7 @@ class DualArm:
         v[~sampled] = 0
         bound = np.inf
         for _ in range(steps):
+            # every v gives a bound; power iteration turns v into the one for which it is tight
             w = self.adjoint(self.forward(v))
             bound = min(bound, float((w[sampled] / v[sampled]).max()))
             v = w / w.max()

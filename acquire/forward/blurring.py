@@ -85,6 +85,7 @@ def blur_matrix(sigma: float, size: int, spatial_merge: int = 1) -> NDArray[np.f
         np.add.at(fine, (at, np.clip(at + distance, 0, size - 1)), weight)
     if spatial_merge > 1:
         starts, lengths = block_bounds(size, spatial_merge)
+        # sums along columns (a voxel is held over them), means along rows: rows of the matrix still sum to 1
         sums = np.add.reduceat(np.add.reduceat(fine, starts, axis=0), starts, axis=1)
         fine = sums / lengths[:, None]
     fine.setflags(write=False)  # the cache hands the same array to everybody
@@ -95,11 +96,13 @@ def kernel(sigma: float) -> NDArray[np.float64]:
     """Return a Gaussian at whole pixels, of odd length, whose standard deviation is ``sigma``."""
     if sigma**2 <= _variance(_gaussian(NARROWEST)):
         return np.ones(1)
+    # brackets the root: at NARROWEST the variance is too small, as just checked, and at sigma + 1 too large
     parameter = brentq(lambda each: _variance(_gaussian(each)) - sigma**2, NARROWEST, sigma + 1, xtol=1e-9)
     return _gaussian(float(parameter))
 
 
 def _gaussian(sigma: float) -> NDArray[np.float64]:
+    # rounded as `gaussian_filter1d` rounds, so that the simulated kernel has the same length
     reach = max(1, int(CUT_AT * sigma + 0.5))
     weights = np.exp(-0.5 * (np.arange(-reach, reach + 1) / sigma) ** 2)
     normalised: NDArray[np.float64] = weights / weights.sum()

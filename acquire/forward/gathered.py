@@ -78,6 +78,7 @@ class _Terms:
         self, weights: NDArray[np.int64], first: NDArray[np.int64], frames: int, arrays: Arrays
     ) -> None:
         count, _, blocks = weights.shape
+        # beyond the last frame the weights are 0, but an index must be valid
         frame = np.minimum(first + np.arange(count)[:, None, None], frames - 1)
         self._xp, self._blocks = arrays.xp, blocks
         voxel = frame * blocks + np.arange(blocks)
@@ -124,6 +125,7 @@ def _crossings(
     weights = np.zeros(((steps - 1) // temporal_merge + 2, *begins.shape), np.int64)
     line, block = np.indices(begins.shape)
     for d in range(steps):
+        # a shorter last block has fewer steps: the others get multiplicity 0, at any valid sub-step
         multiplicity = np.clip(np.minimum(min(d + 1, S), np.minimum(lengths, lengths + S - 1 - d)), 0, None)
         t = np.minimum(begins + d, geometry.span - 1)
         weights[t // temporal_merge - first, line, block] += multiplicity * code[t]
@@ -135,6 +137,7 @@ def _transposed(
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Return the lines (k, frame, block) that meet a frame in a block, and their weights."""
     _, lines, blocks = weights.shape
+    # nonzero and the masks list the crossings in one order, C order of (j, line, block)
     _, line, block = np.nonzero(weights)
     where, weight = frame[weights > 0], weights[weights > 0]
     first = np.full((frames, blocks), lines)
@@ -142,5 +145,6 @@ def _transposed(
     k = line - first[where, block]
     padded = np.zeros((int(k.max(initial=0)) + 1, frames, blocks), np.int64)
     padded[k, where, block] = weight
+    # where fewer lines meet a frame, or none does, the padding is weight 0 at any valid line
     index = np.minimum(first + np.arange(len(padded))[:, None, None], lines - 1)
     return index, padded

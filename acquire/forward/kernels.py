@@ -27,6 +27,7 @@ def _multiplicity(d: int, length: int, S: int) -> int:
     return min(d + 1, length, S, length + S - 1 - d)
 
 
+# without nnan and ninf: solvers notice that they diverge by values that are not finite
 @numba.njit(parallel=True, cache=True, fastmath={"contract", "reassoc", "nsz"})
 def shear(
     voxels: NDArray[Any],
@@ -75,6 +76,7 @@ def unshear(
     # Parallel over frames although the sum is over lines: a line contributes to all frames that it met, so
     # threads with one line each would have to take turns.
     for f in numba.prange(out.shape[0]):
+        # the last frame may have fewer than T_m sub-steps
         t_first, t_end = f * T_m, min((f + 1) * T_m, len(code))
         for q in range(len(starts)):
             out[f, q, :] = 0

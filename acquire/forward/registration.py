@@ -12,7 +12,7 @@ more sub-steps cost nothing. Without an alignment there is no R.
 from __future__ import annotations
 
 from functools import lru_cache
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy import sparse
@@ -22,8 +22,6 @@ from acquire.forward.kernels import gather_frame, gather_frames
 from acquire.forward.merge import block_bounds
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
     from acquire.alignment import Alignment
     from acquire.arrays import Array, Arrays
     from acquire.geometry import Geometry
@@ -70,6 +68,7 @@ def sampling_matrix(alignment: Alignment, size: int, spatial_merge: int = 1) -> 
     rows, columns = (np.clip(each, 0, size - 1).ravel() for each in alignment.sources(size))
     row, column = (each.astype(np.int64) for each in (rows, columns))
     below, right = rows - row, columns - column
+    # at the last row or column the fraction is 0, so that any valid neighbour will do
     next_row, next_column = (np.minimum(each + 1, size - 1) for each in (row, column))
     corners = [
         ((1 - below) * (1 - right), row * size + column),
@@ -79,8 +78,10 @@ def sampling_matrix(alignment: Alignment, size: int, spatial_merge: int = 1) -> 
     ]
     weights, sources = (np.concatenate(each) for each in zip(*corners, strict=True))
     pixels = np.tile(np.arange(size**2), len(corners))
+    # `tocsr` adds up the weights of corners that coincide there
     fine = sparse.coo_array((weights, (pixels, sources)), shape=(size**2, size**2)).tocsr()
     if spatial_merge == 1:
+        # whole-pixel shifts leave corners of weight 0, which would take as long as the others
         fine.eliminate_zeros()
         return fine
     # H = B ⊗ B, (n², n′²), holds voxels over their blocks; its normalised transpose takes the means.
@@ -114,7 +115,14 @@ class _Gather:
             self._first = matrix.indptr.astype(np.uint32)
             self._source, self._weight = matrix.indices.astype(np.uint32), matrix.data.astype(arrays.dtype)
             return
-        self._terms = [(arrays.indices(index), arrays.asarray(weight)) for index, weight in _padded(matrix)]
+        # term j holds the j-th element of every row
+        counts = np.diff(matrix.indptr)
+        for j in range(int(counts.max())):
+            # rows with fewer elements read those of the next row, with weight 0
+            at = np.minimum(matrix.indptr[:-1] + j, matrix.nnz - 1)
+            weight = np.where(counts > j, matrix.data[at], 0.0)
+            index = matrix.indices[at].astype(np.int64)
+            self._terms.append((arrays.indices(index), arrays.asarray(weight)))
 
     def __call__(self, frames: Array) -> Array:
         if not self._terms:
@@ -133,13 +141,3 @@ class _Gather:
         for part in parts:
             total += part
         return xp.reshape(total, frames.shape)
-
-
-def _padded(matrix: sparse.csr_array) -> list[tuple[NDArray[np.int64], NDArray[Any]]]:
-    """Return for each j the source and weight of every row's j-th element; weight 0 if the row has fewer."""
-    counts = np.diff(matrix.indptr)
-    terms = []
-    for j in range(int(counts.max())):
-        at = np.minimum(matrix.indptr[:-1] + j, matrix.nnz - 1)
-        terms.append((matrix.indices[at].astype(np.int64), np.where(counts > j, matrix.data[at], 0.0)))
-    return terms

@@ -53,6 +53,7 @@ class TdiArm:
 
     def forward(self, voxels: NDArray[Any]) -> NDArray[Any]:
         """Return the lines of voxels: (T/T_m, n/N_m, n/N_m) → (L_R, M)."""
+        # `np.empty`, because the loops write every element before they add to it
         sheared = np.empty((self.lines_shape[0], self.voxels_shape[2]), self.dtype)
         shear(voxels, self._code, self._starts, self._lengths, self._S, self._T_m, sheared)
         pixels: NDArray[Any] = blocks_to_pixels(sheared, self._n, self._S, self._N_m)

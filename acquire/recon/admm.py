@@ -119,6 +119,7 @@ class Admm:
         self._w = self._xp.asarray(other._w, copy=True)
         self._lifted = self._operator.adjoint(self._w)
         self._tv_multiplier = other._tv_multiplier * (old.tv_penalty / new.tv_penalty)
+        # the splits are in units of θ; only multipliers are divided by ρ
         self._sign = self._xp.asarray(other._sign, copy=True)
         self._sign_multiplier = other._sign_multiplier * (old.sign_penalty / new.sign_penalty)
 
@@ -127,6 +128,7 @@ class Admm:
 
         This one stays as it is, except for the denoiser's dual field, which both share.
         """
+        # `step` changes w, BᵀW·w and the TV multiplier in place; what it replaces can be shared
         other = copy(self)
         other._parameters = replace(self._parameters, tv_weight=heavier * self._parameters.tv_weight)
         other._strength = self._strength * heavier
@@ -161,9 +163,11 @@ class Admm:
     def _data_step(self) -> Array:
         p = self._parameters
         rho = p.tv_penalty + p.sign_penalty
+        # the grid's rows are orthonormal, so that both splits together are one ρ/2·‖θ − centre‖²
         centre = p.tv_penalty * (self.theta - self._tv_multiplier)
         centre += p.sign_penalty * self._xp.tensordot(self._grid, self._sign - self._sign_multiplier, axes=1)
         centre /= rho
+        # y − W·B·c − (W·B·BᵀW + ρ)·w, with a single product, since `_lifted` is BᵀW·w
         residual = self._samples - self._operator.forward(centre + self._lifted) - rho * self._w
         if not self._xp.isfinite(dot(residual, residual)):
             raise NumericsError(
@@ -176,6 +180,7 @@ class Admm:
         """Make conjugate-gradient steps on (W·B·BᵀW + ρ)·w; ``residual`` is overwritten."""
         scaled = self._precondition(residual)
         direction, energy = self._xp.asarray(scaled, copy=True), dot(residual, scaled)
+        # squared, as the energy is
         enough = self._parameters.gradient_share**2 * energy
         for _ in range(self._parameters.gradient_steps):
             if not energy > 0:  # zero, or not a number

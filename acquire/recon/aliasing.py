@@ -64,6 +64,7 @@ def detect_unresolved_light(
     if span > LARGEST_SPAN or not clock.affords(SECONDS * (span / SPAN) ** 3):
         return ()
     rate_hz = 1e9 / segment.substep_ns
+    # cosine k of the sub-steps is light of k·rate/(2·span)
     first = int(np.ceil(MARGIN * resolved_hz * 2 * span / rate_hz))
     count = int(SHARE * span)
     residual = np.where(problem.usable, problem.samples - predicted, 0)
@@ -71,6 +72,7 @@ def detect_unresolved_light(
     if first + WINDOW > count or not patterns or not residual.any():
         return ()
     basis = TemporalBasis(span, count)
+    # a lamp may be in several patterns, each with a curve of its own: the energies add up
     energy = sum((_energy(segment, each, residual, basis) for each in patterns), np.zeros(count))
     usual = np.maximum(
         percentile_filter(energy, OFTEN, WINDOW, mode="nearest"), np.percentile(energy[first:], OFTEN)
@@ -93,6 +95,7 @@ def _patterns(video: NDArray[Any], size: int) -> list[NDArray[np.float32]]:
     curves = np.linalg.svd(coarse.reshape(frames, -1).astype(np.float64), full_matrices=False)[0][
         :, :PATTERNS
     ]
+    # coarse voxels are enough to find the curves; the patterns keep the voxels of the video
     strongest = list(np.tensordot(curves.T.astype(video.dtype), video, axes=1))
     mean, strips = video.mean(0), []
     for rows in np.array_split(np.arange(side), STRIPS):
@@ -116,6 +119,7 @@ def _energy(
     gram = np.asarray(operator.gram(), np.float64)
     right = np.asarray(operator.adjoint(residual.astype(np.float32)), np.float64)[:, 0]
     inverse = np.linalg.inv(gram + DAMPING * np.trace(gram) / len(gram) * np.eye(len(gram)))
+    # of the damped fit to white noise: the diagonal of (G + δ)⁻¹·G·(G + δ)⁻¹·σ²
     variance = np.einsum("ij,ji->i", inverse @ gram, inverse) * np.square(residual, dtype=np.float64).mean()
     ratio: NDArray[np.float64] = np.square(inverse @ right) / np.maximum(variance, np.finfo(np.float64).tiny)
     return ratio

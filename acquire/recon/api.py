@@ -104,6 +104,7 @@ def reconstruct(
         usable sample
     NumericsError : a dark code, or iterates that are not finite
     """
+    # a budget covers the whole call
     began = time.monotonic()
     chosen = open_solver(solver, solver_options)
     count = preset_iterations(solver, preset)
@@ -130,11 +131,14 @@ def reconstruct(
     # BLAS's threads busy-wait for a core that others use; the arms are computed side by side instead
     threads = 1 if granted_threads() == 1 else idle_cores()
     with limit_threads(threads), limit_blas(1):
+        # the probe times the compiled loops, which tell nothing about other arrays
         if budget_s is not None and refuse and arrays.compiled:
             least_s = least_seconds(segment.geometry, spatial_merge, temporal_merge, solver)
             check_budget(clock, budget_s, least_s)
+        # after the check, because posing the problem (the operator's norm) takes time itself
         problem = build_problem(segment, spatial_merge, temporal_merge, hold_out=held_out, arrays=arrays)
         run = _Run(segment, problem, options, chosen, clock)
+        # before the solver runs, which would otherwise use the whole budget
         if error and chosen.goes_on and static_image is None:
             clock.reserve(RESERVED_ITERATIONS)
         if look is not None:
@@ -190,10 +194,12 @@ class _Run:
         noise = problem.noise(segment)
         quality = Quality(problem.misfit(predicted), prediction, problem.coverage, noise)
         trusted = segment.geometry.trusted_frames(T_m)
+        # whoever stops a run wants the answer now
         check = check and self.options.static_image is None and clock.ended != "stopped"
         checked = check_description(segment, quality, clock) if check else DescriptionCheck()
         facts = estimate.facts()
         cosines = facts.get("temporal_coefficients", len(video))
+        # K cosines over a span resolve K/(2·span)
         resolved_hz = cosines / (2e-9 * segment.substep_ns * T_m * len(video))
         unresolved: tuple[str, ...] = ()
         if check and checked.believed:

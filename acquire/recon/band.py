@@ -134,7 +134,9 @@ class BandOperator:
     @cached_property
     def _grams(self) -> list[NDArray[np.float64]]:
         """B·Bᵀ of each arm, between lines (L_R, L_R)."""
+        # the merging adds only a factor per pixel, whose mean is taken: all are equal if N_m divides S
         each = [np.square(host(m), dtype=np.float64).sum(axis=0).mean() for m in self._mergings]
+        # float64, because neighbouring lines are nearly equal, and the inverse multiplies rounding errors
         exact = [host(factor).astype(np.float64) for factor in self._factors]
         return [float(size) * (factor @ factor.T) for size, factor in zip(each, exact, strict=True)]
 
@@ -199,9 +201,11 @@ def staircase(
     S = geometry.substeps
     first = np.arange(geometry.lines)[:, None] * S
     factor = np.zeros((geometry.lines, len(starts), lit.shape[1]), lit.dtype)
+    # the last block may be shorter, and has other multiplicities then
     for length in np.unique(lengths):
         blocks = np.flatnonzero(lengths == length)
         for d in range(length + S - 1):
+            # in lit's dtype: one of numpy's int64 would make the products float64
             multiplicity = lit.dtype.type(min(d + 1, length, S, length + S - 1 - d))
             factor[:, blocks] += multiplicity * lit[first + starts[blocks] + d]
     return factor

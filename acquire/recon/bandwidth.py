@@ -90,6 +90,7 @@ def light_beyond(
     """
     merge = -(-segment.geometry.size // COARSE_SIDE)
     frames = segment.geometry.video_shape(merge, temporal_merge)[0]
+    # too few cosines beyond the band to have a floor of their own
     if frames // 2 <= count + WINDOW:
         return None
     basis = TemporalBasis(frames, frames // 2)

@@ -78,6 +78,7 @@ class TemporalBasis:
         """x = Dᵀ·θ: (K, …) → (T, …)."""
         if not self.arrays.compiled:
             return _product(self.arrays, self.matrix().T, theta)
+        # `n` pads the coefficients with zeros up to the number of frames
         return self.arrays.asarray(idct(theta, n=self.frames, axis=0, norm="ortho", workers=2))
 
     def analyze(self, video: Array) -> Array:

@@ -172,6 +172,7 @@ def _glance(
 
     start = None if still is None else resized(still, basis)
     if options.initial is not None:
+        # in the solvers' units, as `_Run.in_scene_units` undoes at the end
         start = basis.analyze(problem.arrays.asarray(options.initial / problem.scale))
     estimate = begin(start)
     for _ in clock.run(_at_most(GLANCE, options), "first look", FIRST_LOOK_SHARE, estimate.video):
@@ -205,6 +206,7 @@ def _in_patterns(
     clock: IterationClock,
 ) -> Estimate | None:
     """Patterns and curves from a first look; None if the scene does not consist of a few."""
+    # curves are fitted at the end of a round: less than one gains nothing
     if clock.done >= clock.iterations or not clock.affords(ROUND * clock.longest_s):
         return None
     found = find_patterns(host(first.solver.theta))
@@ -226,8 +228,10 @@ def _for_noise(segment: Segment, problem: Problem, first: InBand) -> AdmmParamet
     Without held-out samples and known noise the NaN leaves the weight as it is.
     """
     noise = problem.noise(segment)
+    # infinite for lines without light, NaN if it is unknown
     if not noise < np.inf:
         noise = NOISE_SHARE * problem.prediction_error(first.predict())
+    # the constant first: `max` returns it if the other is NaN
     return replace(PARAMETERS, tv_weight=max(PARAMETERS.tv_weight, WEIGHT_PER_NOISE * noise))
 
 

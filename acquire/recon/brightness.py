@@ -57,21 +57,26 @@ def fit_brightness(
     lit = (basis[:, frame] * segment.code).T.astype(np.float32)
     merging = column_merging(geometry, spatial_merge).astype(np.float32)
     normal, right, energy, samples = np.zeros((cosines, cosines)), np.zeros(cosines), 0.0, 0
+    # arm B's rows are the scene's columns from right to left
     for arm, view in enumerate((video, video.transpose(0, 2, 1)[:, ::-1])):
         pixels = view.astype(np.float32) @ merging
         for line in np.flatnonzero((problem.weight[arm] > 0).any(axis=1)):
             used = problem.weight[arm, line] > 0
             seen = np.zeros((len(used), cosines), np.float32)
             for u in range(S):
+                # step u of a line exposes row r in sub-step line·S + u + r
                 instants = line * S + u + np.arange(n)
                 seen += pixels[frame[instants], row].T @ lit[instants]
+            # summed over all lines in float64, since the normal matrix is inverted
             rows = seen[used].astype(np.float64)
             normal += rows.T @ rows
+            # pixels are Λ′ itself applied to the video, without the norm that samples are divided by
             lines = problem.samples[arm, line][used].astype(np.float64) * problem.norm
             right += rows.T @ lines
             energy, samples = energy + float(lines @ lines), samples + len(lines)
     if not normal.any():
         return np.ones(frames)  # a dark video explains nothing, however bright
+    # g = 1, to which the prior draws: solved for is g − 1
     flat = basis @ np.ones(frames)
     left = energy - 2 * float(flat @ right) + float(flat @ normal @ flat)
     change = _most_likely(normal, right - normal @ flat, left, samples)

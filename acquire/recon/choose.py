@@ -129,12 +129,14 @@ def _choose(
     plain = bench.attempt(bench.fitting(STILL), FIRST_ITERATIONS)
     at_rest = plain.error < EXPLAINED and not bench.held_out.clearly_less(volume.errors, plain.errors)
     cosines = glance(segment, problem, options, clock, plain.coefficients if at_rest else None)
+    # taken now, because the trials below forget how long the cosines' iterations are
     rest_s = (LONGER_LOOK - GLANCE) * clock.longest_s
     errors = bench.record_errors({"prior": "cosines"} | cosines.facts(), cosines.predict())
     at_a_glance, clear = bench.held_out.relative(errors), _has_clear_patterns(cosines)
     tried = _Tried(volume, plain)
     if not clear:
         tried.smooth = bench.probe(bench.fitting(SMOOTH), min(at_a_glance, tried.best.error))
+        # the first cosine is constant, so that this is the video's mean over time
         picture = host(cosines.basis.matrix()[0, 0] * cosines.solver.theta[0, ...]).clip(0)
         tried.bright = bench.brighten(picture, cosines.basis.count, min(at_a_glance, tried.best.error))
     ahead, refined = at_a_glance <= OUTDONE * tried.best.error, None
@@ -169,11 +171,6 @@ class _Tried:
     def best(self) -> Trial:
         trials = (self.volume, self.plain, self.smooth, self.bright)
         return min((trial for trial in trials if trial is not None), key=_error)
-
-
-def _better(moving: Trial, still: Trial) -> Trial:
-    most = 1 - LEAST_GAIN if moving.candidate.change else CLEARLY
-    return moving if moving.error < most * still.error else still
 
 
 def _wins(bench: Workbench, refined: Estimate, best: Trial) -> bool:
@@ -220,7 +217,9 @@ def _search(bench: Workbench, tried: _Tried, trials: int, rival: float) -> Trial
     flows = smooth.error < SMOOTHER * volume.error and bench.held_out.clearly_less(
         smooth.errors, still.errors
     )
-    return _better(smooth if flows else volume, still)
+    moving = smooth if flows else volume
+    most = 1 - LEAST_GAIN if moving.candidate.change else CLEARLY
+    return moving if moving.error < most * still.error else still
 
 
 def _worth_refining(bench: Workbench, cosines: InBand, best: Trial) -> bool:

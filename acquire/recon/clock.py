@@ -158,6 +158,7 @@ class IterationClock:
             self._stage = stage
             if video is not None:
                 self.show(stage, video)
+        # no iteration of the stage fitted: what is known of others remains
         if not self._recent_s:
             self._recent_s = before
 
@@ -166,6 +167,7 @@ class IterationClock:
 
         At least one runs. They are not shown: call `show` with the best candidate after a trial.
         """
+        # a trial's iterations take their own time, which tells nothing about those before or after it
         self._recent_s, self._stage = deque(maxlen=REMEMBERED), ""
         for tried in range(most):
             if tried and (self._stopped() or not self.affords(self.longest_s, share)):
@@ -185,6 +187,7 @@ class IterationClock:
 
     def spent(self, share: float) -> bool:
         """Whether this share of the budget is used up, or a stop was requested."""
+        # before the first iteration there is no result to stop with
         if self.made and self._stopped():
             return True
         return self._budget_s is not None and self.seconds > share * self._budget_s
@@ -220,6 +223,7 @@ class IterationClock:
             return False
         if not self.made or self.affords(expected, share):
             return True
+        # a stage that has used up its share ends, but not the run
         if share >= 1:
             self.ended = "budget"
         return False

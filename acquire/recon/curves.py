@@ -116,6 +116,7 @@ class CurveFit:
         def normal(x: Array) -> Array:
             return exact.asarray(operator.adjoint(operator.forward(arrays.asarray(x)))) + damping * x
 
+        # the damping holds back the change, the prior the curves: only the latter pulls at the start
         right = exact.asarray(gradient - precision * start)
         change = _conjugate_gradients(normal, right, self._precondition, STEPS if small else PLAIN_STEPS)
         fitted: NDArray[np.float64] = start + host(change)
@@ -135,6 +136,7 @@ class CurveFit:
         samples = np.count_nonzero(self._problem.weight)
         gram *= samples / self._problem.weight.size / self._problem.norm**2
         self._damping = max(self._ridge * float(np.trace(gram)) / len(gram), float(np.finfo(np.float32).tiny))
+        # in the order of `gram`: all cosines of a pattern, then those of the next
         before, slope = start.T.ravel().astype(np.float64), gradient.T.ravel().astype(np.float64)
         if self._learns and self.prior is None and start.any():
             self.prior = CurvePrior(np.square(start, dtype=np.float64).mean(1), energy / samples)
@@ -173,6 +175,7 @@ class CurveOperator:
         self._arrays, self._xp = cosines.arrays, cosines.arrays.xp
         self._width = segment.geometry.size + segment.geometry.substeps - 1
         substeps = np.arange(segment.geometry.span)
+        # (line, s): the n + S − 1 sub-steps that a line integrates
         windows = np.asarray(self._firsts)[:, None] + np.arange(self._width)
         self._frame = self._arrays.indices(substeps // temporal_merge)
         self._windows = self._arrays.indices(windows.ravel())
@@ -182,6 +185,7 @@ class CurveOperator:
         blurred = blurring(segment.blur, segment.geometry, 1, self._arrays)
         if blurred is not None:
             patterns, view_b = blurred.forward(0, patterns), blurred.forward(1, view_b)
+        # arm B's rows are the scene's columns from right to left
         views = (patterns, self._xp.flip(self._xp.permute_dims(view_b, (0, 2, 1)), axis=1))
         merging = self._arrays.asarray(column_merging(segment.geometry, 1))
         self._profiles = [_profiles(self._xp, view, merging, segment.geometry.substeps) for view in views]
@@ -201,14 +205,23 @@ class CurveOperator:
         back = lines[0, ...] @ a.T + lines[1, ...] @ b.T
         windows = xp.permute_dims(xp.reshape(back, (-1, self._rank, self._width)), (0, 2, 1))
         light = self._arrays.zeros((self._geometry.span, self._rank))
+        # windows overlap, and the array API has no addition at repeated indices
         for line, first in enumerate(self._firsts):
             light[first : first + self._width, :] += windows[line, ...]
-        return self._to_cosines(light * self._code[:, None])
+        light = light * self._code[:, None]
+        if self._merge > 1:
+            # dark sub-steps complete the last frame
+            missing = -light.shape[0] % self._merge
+            dark = xp.zeros((missing, light.shape[1]), dtype=light.dtype, device=light.device)
+            frames = xp.reshape(xp.concat([light, dark]), (-1, self._merge, light.shape[1]))
+            light = xp.sum(frames, axis=1)
+        return self._matrix @ light
 
     def gram(self) -> Array:
         """The normal matrix of all samples in float64, unknowns in the order of (R, K)."""
         xp, K, R, exact = self._xp, self._matrix.shape[0], self._rank, self._arrays.exact()
         gram = exact.zeros((R, K, R, K))
+        # elsewhere G is 0
         lit = self._arrays.indices(np.flatnonzero(host(self._code)))
         # float64: rounding in float32 could make it indefinite
         cosines = exact.asarray(xp.take(self._matrix, xp.take(self._frame, lit), axis=1))
@@ -217,19 +230,18 @@ class CurveOperator:
         for k in range(R):
             for other in range(k + 1):
                 Q = sum(each[k, ...] @ each[other, ...].T for each in shaped)
-                pair = cosines @ self._between(Q, lit) @ cosines.T
+                # Σ_i Q(t − iS, t' − iS), of which only the sub-steps with light count
+                between = self._shifted(Q, self._geometry.lines)
+                between = xp.take(xp.take(between, lit, axis=0), lit, axis=1)
+                pair = cosines @ between @ cosines.T
                 gram[k, :, other, :], gram[other, :, k, :] = pair, pair.T
         return xp.reshape(gram, (R * K, R * K))
-
-    def _between(self, Q: Array, lit: Array) -> Array:
-        """Σ_i Q(t − iS, t' − iS) for one pair of patterns, at the sub-steps with light."""
-        total = self._shifted(Q, self._geometry.lines)
-        return self._xp.take(self._xp.take(total, lit, axis=0), lit, axis=1)
 
     def _shifted(self, Q: Array, lines: int) -> Array:
         """Σ_i Q shifted by iS in both directions, from the sum for half of the lines."""
         if lines == 1:
             return Q
+        # doubling adds up log₂ L large matrices instead of L
         half, S = self._shifted(Q, lines // 2), self._geometry.substeps
         parts = [(0, half), (lines // 2 * S, half)] + [((lines - 1) * S, Q)] * (lines % 2)
         span = self._width + (lines - 1) * S
@@ -242,15 +254,6 @@ class CurveOperator:
     @property
     def _firsts(self) -> range:
         return range(0, self._geometry.lines * self._geometry.substeps, self._geometry.substeps)
-
-    def _to_cosines(self, light: Array) -> Array:
-        """(T, …) → (K, …): sub-steps summed to frames, frames analysed."""
-        if self._merge > 1:
-            xp, missing = self._xp, -light.shape[0] % self._merge
-            dark = xp.zeros((missing, light.shape[1]), dtype=light.dtype, device=light.device)
-            frames = xp.reshape(xp.concat([light, dark]), (-1, self._merge, light.shape[1]))
-            light = xp.sum(frames, axis=1)
-        return self._matrix @ light
 
 
 def _conjugate_gradients(
@@ -265,6 +268,7 @@ def _conjugate_gradients(
         if not energy > 0 or not curvature > 0:
             break
         x += (energy / curvature) * direction
+        # not in place: in the first step it is still the caller's `right`
         residual = residual - (energy / curvature) * image
         scaled = precondition(residual)
         energy, before = float(dot(residual, scaled)), energy

@@ -75,6 +75,7 @@ class HaarShrink:
 
     def prox(self, frames: Array, weight: float | Array) -> Array:
         """Shrink the details by ``weight``."""
+        # one threshold per frame, whether the weight is a number or (K,)
         threshold = (namespace(frames).zeros_like(frames[:, 0, 0]) + weight)[:, None, None]
         smooth, details = frames, namespace(frames).zeros_like(frames)
         for level in range(self._levels):
@@ -97,6 +98,7 @@ def _level(smooth: Array, step: int, threshold: Array) -> tuple[Array, Array]:
     kept = []
     for band, sign in zip(bands[1:], _SIGNS, strict=True):
         xp = namespace(band)
+        # bands are sums of four voxels over 4, not 2 as in an orthonormal transform: half of its threshold
         shrunk = xp.sign(band) * xp.maximum(xp.abs(band) - threshold / 2, 0)
         kept.append(_undo(shrunk, step, sign))
     return _undo(bands[0], step, (1, 1)), sum(kept[1:], kept[0])

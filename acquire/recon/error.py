@@ -226,6 +226,7 @@ def measure_indicators(
     scale = full_scale(shown)
     if not (scale > 0 and residual > 0):
         return None
+    # ratios and logarithms are taken of what follows: none of it may be 0
     floor = exponents.floor * scale
     change, edge = shown - shown.mean(0), np.zeros_like(shown)
     edge[:, :-1] += np.square(np.diff(shown, axis=1))
@@ -253,6 +254,7 @@ def error_from(indicators: Indicators, trusted: slice, exponents: Exponents | No
         * (indicators.change / change) ** exponents.local_change
         * (indicators.edge / edge) ** exponents.local_edge
     )
+    # regions share out the whole's error: their RMS is `error`, as is that of the trusted frames below
     regions = error * relative / rms_of(relative)
     frame_rms = np.sqrt(np.square(indicators.sensitivity).mean((1, 2)))
     frames = (frame_rms / whole) ** exponents.frame_sensitivity
@@ -281,6 +283,7 @@ def log_indicators(sensitivity: float, indicators: Indicators) -> NDArray[np.flo
 def in_regions(frames: NDArray[Any]) -> NDArray[np.float64]:
     """Means (time, 8, 8) of frames (time, row, column); a voxel in two regions counts with its shares."""
     side = frames.shape[1]
+    # (region, voxel): length of each voxel's overlap with each region, since 8 need not divide the side
     edges, voxel = np.linspace(0, side, REGIONS + 1), np.arange(side)
     overlap = np.minimum(edges[1:, None], voxel + 1) - np.maximum(edges[:-1, None], voxel)
     held = np.maximum(overlap, 0)

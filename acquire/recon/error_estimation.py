@@ -92,6 +92,7 @@ def estimate_error(
         return continued
     indicators = measure_indicators(
         video,
+        # clipped as the video is that it is compared with
         np.maximum(continued.video * problem.scale, 0),
         white_error(segment, problem, residual, merges),
         trusted,
@@ -176,6 +177,7 @@ def white_error(segment: Segment, problem: Problem, residual: float, merges: tup
     operator = DualArm(
         segment.geometry, segment.code, *merges, alignment=segment.alignment, blur=segment.blur
     )
+    # ±1 has an RMS of exactly 1; from int8 and in place, because a video can be large
     signs = np.random.default_rng(0).integers(0, 2, operator.video_shape, np.int8).astype(np.float32)
     signs *= 2
     signs -= 1

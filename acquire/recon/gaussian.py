@@ -92,6 +92,7 @@ class Response:
             (slice(begin, end), _block_sums(running[:, begin:end], first, rows, blocks).astype(np.float32))
             for begin, end, blocks in tiers
         ]
+        # a uniform scene at rest is cosine 0 in every block
         self.flat: Floats = self.tiers[0][1][:, :, 0].sum(1, dtype=np.float64)
 
     def covariance(self, prior: Prior) -> Floats:
@@ -144,9 +145,11 @@ class Model:
     @classmethod
     def of(cls, response: Response, prior: Prior, pixels: int) -> Model:
         covariance = response.covariance(prior)
+        # a prior's noise is relative to the light, whose mean variance becomes 1
         unit = max(float(np.trace(covariance)) / len(covariance), SMALLEST)
         values, vectors = np.linalg.eigh(covariance / unit)
         across = np.linalg.eigh(correlation(pixels, prior.length))
+        # rounding of the float32 products leaves eigenvalues slightly below 0
         return cls(response, prior, vectors, np.maximum(values, 0), across[1], across[0], unit)
 
     def with_noise(self, noise: float) -> Model:
@@ -190,6 +193,7 @@ class Model:
 
     def evidence(self, modes: Floats) -> float:
         """Log likelihood of lines given as modes."""
+        # as `fit` with its single regressor, but without the blocks: the ladder tries this for every noise
         level, weighted = self._level, self._level / self._variance
         rest = modes - float((weighted * modes).sum() / (weighted * level).sum()) * level
         scale = max(float((rest**2 / self._variance).mean()), SMALLEST)
@@ -206,6 +210,7 @@ class Model:
     def _blocks(self, rest: Floats, scale: float) -> Floats:
         """Log likelihood, divided among blocks of lines by their share of the quadratic form."""
         lines = self.response.lines
+        # back from modes to lines; across pixels modes do as well, since sums of squares are the same
         values, pulled = self._vectors @ rest, self._vectors @ (rest / self._variance)
         per_line = (values * pulled).sum(1) / scale
         constant = (np.log(self._variance).sum() + rest.size * np.log(scale)) / lines
@@ -214,6 +219,7 @@ class Model:
 
     def scene(self, fit: Fit) -> NDArray[np.float32]:
         """The most likely slow scene (fine row, cosine, pixel), in units of the lines per sub-step."""
+        # C⁻¹·lines, then the prior's covariance times Fᵀ: the mean of the scene given the lines
         pulled = self._vectors @ (fit.modes / self._variance) / self._unit
         pulled = ((pulled * self._pixel_values) @ self._pixel_vectors.T).astype(np.float32)
         parts = []
@@ -222,6 +228,7 @@ class Model:
             part = np.tensordot(near, np.tensordot(factor, pulled, axes=(0, 0)), axes=1)
             part *= self.prior.spectrum[cosines, None].astype(np.float32)
             parts.append(np.repeat(part, self.response.pixels * self.response.finer // len(part), axis=0))
+        # u is steady (cosine 0) and the same in all rows
         parts[0][:, 0] += np.float32(fit.level)
         return np.concatenate(parts, axis=1)
 
@@ -250,6 +257,7 @@ def best_model(response: Response, arms: list[Floats]) -> Model:
         model = Model.of(response, step, arms[0].shape[1])
         modes = [model.modes(arm) for arm in arms]
         for noise in NOISES:
+            # noise only adds to the eigenvalues: one decomposition serves all
             noisy = model.with_noise(noise)
             total = sum(noisy.evidence(each) for each in modes)
             if best is None or total > best[0]:

@@ -57,6 +57,7 @@ def _drawn(
     shape: tuple[int, ...], size: tuple[int, int], share: float, rng: np.random.Generator
 ) -> NDArray[np.bool_]:
     """Mask of one arm's tiles of ``size``: a share of them, rounded at random, is drawn."""
+    # one more than cover the arm, because the origin is random
     tiles = [-(-length // side) + 1 for length, side in zip(shape, size, strict=True)]
     count = tiles[0] * tiles[1]
     chosen = np.zeros(count, bool)
@@ -76,6 +77,7 @@ class HeldOut:
     def __init__(self, problem: Problem, geometry: Geometry) -> None:
         mask = problem.held_out
         labels = [label(arm)[0] for arm in mask]
+        # blocks are numbered through both arms
         labels[1] = np.where(labels[1] > 0, labels[1] + labels[0].max(), 0)
         self._block = np.stack(labels)[mask]
         self._samples = problem.samples[mask].astype(np.float64)
@@ -96,6 +98,7 @@ class HeldOut:
     def errors(self, predicted: NDArray[Any]) -> NDArray[np.float64]:
         """Weighted sum of squared errors of each block."""
         squares = self._weight * (predicted[self._mask] - self._samples) ** 2
+        # label 0 is what lies between the blocks
         return np.asarray(np.bincount(self._block, squares)[1:], np.float64)
 
     def relative(self, errors: NDArray[np.float64]) -> float:

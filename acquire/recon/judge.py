@@ -51,12 +51,14 @@ def frame_error(
     last = np.clip((ends - 1) // S + 1, 0, L)
     residual, level = running[:, last] - running[:, first]
     with np.errstate(invalid="ignore", divide="ignore"):
+        # differences of running sums can be slightly negative by rounding
         ratio = np.sqrt(np.maximum(residual, 0) / level)
     return np.where(level > 0, ratio, np.nan).astype(np.float32)
 
 
 def judge(segment: Segment, problem: Problem, quality: Quality, trusted: slice) -> tuple[str, ...]:
     """Return the reasons not to trust this video, as sentences for the user."""
+    # a constant code is reported below, by its density
     found = [
         each.words for each in (*unusable(segment), *black_level_off(segment)) if each.kind != "constant_code"
     ]
@@ -72,6 +74,7 @@ def judge(segment: Segment, problem: Problem, quality: Quality, trusted: slice) 
             f"where noise alone is {quality.noise:.2%}, and the held-out samples by "
             f"{quality.prediction:.2%}; larger voxels have less noise"
         )
+    # above `POOR_MISFIT` the first warning says more
     if quality.standing == "not explained" and WORTH_SAYING < residual <= POOR_MISFIT:
         found.append(
             f"the video misses the lines by {residual:.2%}, and their noise is {quality.noise:.2%}: the rest "

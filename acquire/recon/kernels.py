@@ -25,6 +25,7 @@ SMALLEST_WEIGHT = 1e-12
 """Weight below which the prox is the identity: it changes no pixel by more than 4·λ, and 1/λ² would
 overflow."""
 
+# without nnan and ninf: solvers notice that they diverge by values that are not finite
 _FAST = {"contract", "reassoc", "nsz", "arcp"}
 
 
@@ -46,6 +47,7 @@ def tv_prox(
         for _ in range(iterations):
             _primal(frames[k], ahead[0], ahead[1], weights[k], out[k])
             following = (1 + np.sqrt(1 + 4 * momentum * momentum)) / 2
+            # in the frames' dtype: with a float64, the loops would compute in double precision
             push = out.dtype.type((momentum - 1) / following)
             _dual_step(out[k], weights[k], push, dual[k, 0], dual[k, 1], ahead[0], ahead[1])
             momentum = following
@@ -119,10 +121,12 @@ def joint_tv_prox(
         out[:] = frames
         return
     rows = frames.shape[1]
+    # of the dual problem of all frames, whose gradient has a Lipschitz constant of 8·(largest weight)²
     steps = weights / (8 * largest * largest)
     ahead = dual.copy()
     momentum = 1.0
     for _ in range(iterations):
+        # two loops: the dual step of a row needs the primal's next row, and the primal the dual's row before
         for r in numba.prange(rows):
             _joint_primal(frames, ahead, r, weights, out)
         following = (1 + np.sqrt(1 + 4 * momentum * momentum)) / 2
@@ -254,6 +258,7 @@ def _volume_dual_step(
     instants, rows, columns = x.shape
     one, slow = x.dtype.type(1), x.dtype.type(step * pace)
     for r in range(rows):
+        # in the last row and instant the neighbour is the voxel itself: a difference of 0
         here, below, later = x[t, r], x[t, min(r + 1, rows - 1)], x[min(t + 1, instants - 1), r]
         p, q, s = dual[0, t, r], dual[1, t, r], dual[2, t, r]
         p_ahead, q_ahead, s_ahead = ahead[0, t, r], ahead[1, t, r], ahead[2, t, r]

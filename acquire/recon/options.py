@@ -59,6 +59,7 @@ class SolveOptions:
             raise UsageError(
                 f"{self.iterations!r} iterations are not possible", possible="an integer of at least 1"
             )
+        # solvers name in `takes` what they support, so that nothing is ignored silently
         for option, given in (
             ("initial", self.initial),
             ("denoiser", self.denoiser),

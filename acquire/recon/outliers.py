@@ -46,6 +46,7 @@ def _spikes(samples: NDArray[np.float64], left: NDArray[np.bool_]) -> NDArray[np
     if samples.shape[1] < SPIKE_LINES or not left.any():
         return np.zeros_like(left)
     deviation = np.abs(samples - median_filter(samples, size=(1, SPIKE_LINES, 1), mode="nearest"))
+    # standard deviation of normal noise with this median
     spread = 1.4826 * np.median(deviation[left])
     level = np.quantile(np.abs(samples[left]), 0.99)
     return np.asarray(deviation > SPIKE_DEVIATIONS * spread + SPIKE_LEVEL * level)

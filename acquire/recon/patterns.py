@@ -101,6 +101,7 @@ def find_patterns(theta: NDArray[Any], *, beyond_doubt: bool = False) -> Pattern
     flat = theta.reshape(count, -1).astype(np.float64)
     energy, vectors = np.linalg.eigh(flat @ flat.T)
     energy, vectors = np.maximum(energy[::-1], 0), vectors[:, ::-1]
+    # energies are squares of singular values, for whose ratios the limits are given
     gaps = np.flatnonzero(energy[: TAIL - 1] > GAP**2 * energy[1:TAIL]) + 1
     rank = int(gaps[-1]) if len(gaps) else 0
     if not _is_enough(rank, energy, LARGEST_REST_AT_GAP):
@@ -209,11 +210,13 @@ class Refinement:
     def return_to(self, found: Patterns) -> None:
         """Make ``found``, the result of an earlier round, the estimate."""
         self.found = found
+        # sets the operator of these curves, which `predict` needs
         self._operators()
 
     def restricted(self, found: Patterns) -> Refinement:
         """A refinement that continues from here with fewer patterns, in pixels; this one stays as it is."""
         other = copy(self)
+        # from the present state: fewer patterns that start from voxels have not yet taken their light back
         other._start(found)
         other._fit = CurveFit(
             self.segment, self._problem, self._cosines, self._temporal_merge, RIDGE, learns=True
@@ -245,6 +248,7 @@ class Refinement:
         """
         found, flat = self.found, host(self.found.patterns).reshape(self.rank, -1).astype(np.float64)
         _, turn = np.linalg.eigh(flat @ flat.T)
+        # in principal axes, strongest first, the last patterns hold the least light
         turn = turn[:, ::-1].astype(found.curves.dtype)
 
         def strongest(count: int) -> Patterns:
@@ -260,6 +264,7 @@ class Refinement:
 
         excess, needed = beyond_noise(), self.rank
         while needed > 1:
+            # only to predict with fewer: the present ones come back below
             self.return_to(strongest(needed - 1))
             without = beyond_noise()
             if not without < NEEDED * excess:
@@ -295,8 +300,10 @@ class Refinement:
         root = np.linalg.cholesky(gram + 1e-6 * np.trace(gram) * np.eye(self.rank))
         # orthonormal patterns make the fit well conditioned; the curves take over their sizes for it
         unit = arrays.xp.reshape(arrays.asarray(exact.asarray(np.linalg.inv(root)) @ flat), patterns.shape)
+        # curves of unit patterns, and then (solve) of the patterns as they were
         fitted = self._fit(unit, self.found.curves @ root)
         left, middle, right = np.linalg.svd(np.linalg.solve(root.T, fitted.T).T, full_matrices=False)
+        # left·right is the nearest orthonormal matrix; the patterns take the rest, so that Θ stays the same
         rotated = exact.asarray((right.T * middle) @ right) @ flat
         self.found = Patterns(
             (left @ right).astype(arrays.dtype), arrays.xp.reshape(arrays.asarray(rotated), patterns.shape)

@@ -104,6 +104,7 @@ class Problem:
         usual = HUBER * NORMAL * float(np.median(residual[self.usable]))
         if not usual > 0:
             return self
+        # equal to 1 up to `usual`, so that normal residuals keep their weight
         weight = np.sqrt(usual / np.maximum(residual, usual)).astype(self.weight.dtype)
         return replace(self, robust_weight=weight)
 
@@ -167,6 +168,7 @@ class MaskedOperator:
         if whole is None:
             return None
         xp = namespace(self.weight)
+        # with W = largest·mask: mask·(B·Bᵀ + damping/largest²)⁻¹/largest²
         largest = float(xp.max(self.weight))
         mask = xp.astype(self.weight > 0, self.weight.dtype)
         inverse = whole(damping / largest**2)
@@ -207,6 +209,7 @@ def build_problem(
     norm = operator.norm_bound(steps=5)
     flat = operator.forward(np.ones(operator.video_shape, np.float32))
     scale = _scale(samples[usable], flat[usable])
+    # drawn by a seed, so that runs on the same lines are judged by the same samples
     held_out = held_out_blocks(usable, hold_out, seed)
     if not (usable & ~held_out).any():
         held_out = np.zeros_like(usable)

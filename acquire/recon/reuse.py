@@ -111,6 +111,7 @@ def reuse_choice(bench: Workbench, segment: Segment, options: SolveOptions, tria
     else:
         still = bench.attempt(bench.fitting(STILL), FIRST_ITERATIONS)
     fits = at_rest and choice.fits(still.error, noise)
+    # if noise is all that a still leaves, nothing has to move
     if fits or still.error <= AS_CLOSELY * noise or clock.spent(SEARCH_SHARE):
         return bench.finish(_strengthened(still))
     if at_rest:
@@ -144,6 +145,7 @@ def _in_cosines(bench: Workbench, still: Trial, segment: Segment, options: Solve
     problem, clock, choice = bench.problem, bench.clock, options.choice
     assert choice is not None
     options = replace(options, bandwidth=min(1.0, choice.coefficients / bench.frames))
+    # as in `choose`: from a start at zero the code would stay in the brightness
     start = still.admm.theta if still.error < EXPLAINED else None
     cosines = first_look(segment, problem, options, clock, start)
     bench.record_errors({"prior": COSINES} | cosines.facts(), cosines.predict())

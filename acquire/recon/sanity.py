@@ -60,6 +60,7 @@ def _stuck(arm: str, lines: Floats, count: int) -> list[Suspicion]:
     """Whether most of an arm's lit columns do not change from line to line."""
     seen = np.isfinite(lines).any(0)
     lowest, highest = np.nanmin(lines[:, seen], axis=0), np.nanmax(lines[:, seen], axis=0)
+    # a single line cannot change, and darkness does not
     if count == 1 or not highest.any():
         return []
     still = lowest == highest
@@ -122,6 +123,7 @@ def _constant(name: str, lines: Floats, model: Model, mean: float) -> list[Suspi
 
 def _little_light(name: str, lines: Floats, model: Model, mean: float) -> list[Suspicion]:
     modes = model.modes(lines)
+    # the prior's noise is a power of ten; electrons need it more precisely
     noisy = max(
         (model.with_noise(model.prior.noise * step) for step in NOISE_STEPS),
         key=lambda each: each.evidence(modes),

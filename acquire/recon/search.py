@@ -173,6 +173,7 @@ def _search(model: LineModel, plain: Hypothesis) -> tuple[Candidate, tuple[Candi
     Among candidates that are not clearly different, the one that changes least of the description is first.
     """
     model.fit_prior(plain)
+    # after the prior: agreement by chance depends on it
     chance = ByChance.of(model, plain)
     described = chance.judged(_contrast(model, plain))
     found = []

@@ -129,11 +129,13 @@ class Stream:
         begin, end = stretch.begin - fade_in, stretch.end + fade_out
         if self.is_slow(stretch.voxels):
             first_line = max(self.first_line, begin // S)
+            # the sub-steps of a line: the last line has to end within the stretch
             exposed = self.geometry(1).span
             end_line = -(-(end - exposed) // S) + 1
         else:
             first_line = max(self.first_line, (begin - self.geometry(1).seam_substeps(T_m)) // S)
             frames = -(-(end - S * first_line) // T_m)
+            # what the first row shows in sub-step t is in line t // S, so that lines go up to the frames' end
             end_line = first_line - (-frames * T_m // S)
         lines = max(1, min(self.end_line, end_line) - first_line)
         return SubSegment(stretch.begin, stretch.end, stretch.voxels, first_line, lines, fade_in, fade_out)
@@ -243,6 +245,7 @@ class Grid:
         if have == want:
             return timed
         edges = [np.append(np.arange(0, self.size, merge), self.size) for merge in (have, want)]
+        # one axis after the other, since voxels are products of intervals
         rows = _means(np.moveaxis(timed, 1, 0), *edges)  # (row, t, column)
         planes = _means(np.moveaxis(rows, 2, 0), *edges)  # (column, row, t)
         return np.ascontiguousarray(planes.transpose(2, 1, 0))
@@ -297,9 +300,11 @@ class Stitcher:
         weighted = [each * weights.reshape(-1, *[1] * (each.ndim - 1)) for each in channels]
         if self._waiting is not None:
             for channel, waiting in zip(weighted, self._waiting, strict=True):
+                # what waits begins with this sub-segment's first frame (`stop` below)
                 channel[: len(waiting)] += waiting
         stop = frames.stop if following is None else self.grid.frames_of(following).start
         done = stop - frames.start
+        # copies, because views would keep whole sub-segments in memory
         self._waiting = [channel[done:].copy() for channel in weighted]
         self.frames = stop
         return [channel[:done] for channel in weighted]

@@ -81,6 +81,7 @@ class _Course:
         self.recent = self.before = np.inf
         self._best, self._kept, self._idle = np.inf, (refinement, refinement.found), 0
         self._loosened = [(np.inf, refinement.parameters.tv_weight)]
+        # an RMS of N values has a relative standard error of 1/√(2N)
         self._doubt = SURE / np.sqrt(2 * max(1, problem.held_out.sum()))
 
     def settles(self, clock: IterationClock, patience: int, most: int | None = None) -> bool:
@@ -104,6 +105,7 @@ class _Course:
         least_gain = LEAST_GAIN if self.refinement.loosens else LEAST_GAIN_HELD
         self._idle = self._idle + 1 if error >= (1 - least_gain) * self.recent else 0
         self.recent = min(self.recent, error)
+        # NaN, without held-out samples, makes the last round the best
         if not error >= self._best:
             self._best, self._kept = error, (self.refinement, self.refinement.found)
         if self.refinement.loosens:

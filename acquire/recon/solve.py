@@ -104,6 +104,7 @@ class KnownImage:
         patterns = self._image[None] / np.linalg.norm(self._image)
         self._operator = CurveOperator(segment, patterns, basis, options.temporal_merge)
         coefficients = np.zeros((frames, 1))
+        # a single iteration, but one of the clock's, so that progress and time are counted
         for _ in clock.run(1, "light"):
             coefficients = CurveFit(segment, problem, basis, options.temporal_merge)(patterns, coefficients)
         self._coefficients = arrays.asarray(coefficients)

@@ -76,6 +76,7 @@ class FrameTv:
         p_ahead, q_ahead, momentum = p, q, 1.0
         for _ in range(self.iterations):
             x = frames + used * _divergence(p_ahead, q_ahead)
+            # `ahead` is 0 at the ends, so that p and q stay 0 there, as `_divergence` requires
             new_p, new_q = p_ahead + step * ahead(x, 1), q_ahead + step * ahead(x, 2)
             length = xp.maximum(xp.sqrt(self._together(new_p**2 + new_q**2)), 1)
             new_p, new_q = new_p / length, new_q / length

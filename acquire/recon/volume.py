@@ -61,6 +61,7 @@ class VolumeTv:
         if self._dual is None:
             self._dual = xp.stack([xp.zeros_like(frames)] * 3)
             count = frames.shape[0]
+            # computed in float64, lest frames of float64 get cosines that are rounded to float32
             matrix = TemporalBasis(count, count, Arrays(dtype="float64")).matrix()
             self._instants = xp.asarray(matrix, dtype=frames.dtype, device=frames.device)
         volume = xp.tensordot(self._instants.T, frames, axes=1)
@@ -128,6 +129,7 @@ class Smooth:
         xp, weight = namespace(frames), _one(weight)
         if self._cosines is None:
             count, side, _ = frames.shape
+            # frequencies in radians per pixel; the time axis counts as long as a side, whatever its instants
             k = np.square(np.pi * np.arange(side) / side)
             t = np.square(self.pace * np.pi * np.arange(count) / side)
             square = np.square(t[:, None, None] + k[:, None] + k)

@@ -276,6 +276,7 @@ class Workbench:
             denoiser=denoiser,
             background=self._background(basis),
         )
+        # multipliers and w fit only as many unknowns of the same kind
         if (
             start is not None
             and start.bench.fine == self.fine

@@ -34,6 +34,7 @@ def balance_of_recording(
     found = balance_of(segments)
     if found is None:
         return None, None, ()
+    # a calibration marks the lines that it has balanced
     measured = any(each.balanced for each in segments)
     if not found.clear:
         return None, found.facts(corrected=False), ()

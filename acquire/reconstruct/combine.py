@@ -101,10 +101,12 @@ def combine(
     options = replace(options, balance=balance)
     sharing = options.chooses and (bool(request.tiles) if options.shared is None else options.shared)
     tiles: Sequence[Tile | None] = request.tiles or (None,)
+    # the first tile makes the choice for the others
     if sharing and len(tiles) > 1:
         tiles = liveliest_first(recording, request, options)
     tasks = [Task(location, each, grid, options, tile=tile) for tile in tiles for each in segments]
     budget = Budget(options.budget_s, called if began is None else began, pool.workers)
+    # refused before anything is written
     budget.check(tasks, request.stream.geometry(1))
     times, anchor = Times.of(recording), _anchor(recording, request)
     done: list[dict[str, Any]] = []
@@ -145,7 +147,9 @@ def _solved(
     submitted = 0
     waiting: deque[Future[Part]] = deque()
     for index, task in enumerate(tasks):
+        # one more than there are workers, so that none of them waits while a part is being written
         while submitted < len(tasks) and len(waiting) <= pool.workers and not watcher.stopped:
+            # the first task always runs, because a video needs one
             if (submitted and budget.exhausted) or (waiting and choices.pending(tasks[submitted])):
                 break
             after = len(tasks) - submitted - 1
@@ -168,6 +172,7 @@ def _result(waiting: deque[Future[Part]], pool: Pool, watcher: Watcher) -> Part 
                 pool.stop()
                 for each in (future, *waiting):
                     each.cancel()
+        # tasks that end sooner than `LOOK_S` are reported, too
         watcher(pool.share_done())
         return future.result()
     except CancelledError:
@@ -199,6 +204,7 @@ def describe_parts(
         known = [part["quality"][key] for part in parts if part["quality"][key] is not None]
         return float(np.sqrt(np.mean(np.square(known)))) if known else None
 
+    # parts may be fewer than ranges: a stop or the budget has ended the others
     segments = [
         {"name": name, "why": why, **part} for name, why, part in zip(names, reasons, parts, strict=False)
     ]
@@ -269,6 +275,7 @@ def _trusted_frames(request: VideoRequest, frames: int, trusted: tuple[int, int]
     T_m, begin = request.grid.voxels.temporal_merge, request.grid.begin
     low = max(request.trusted[0], trusted[0]) - begin
     high = min(request.trusted[1], trusted[1]) - begin
+    # the last frame of the grid may be shorter than T_m
     stop = -(-high // T_m) if begin + high >= request.grid.end else high // T_m
     first = min(frames, -(-low // T_m))
     return [first, max(first, min(frames, stop))]

@@ -58,13 +58,14 @@ def explain(
     """
     merges = (spatial_merge, temporal_merge)
     # A first run compiles, so that no trial is timed with it.
-    reconstruct(calibrated(segment, known), *merges, iterations=1, check=False)
+    reconstruct(calibrated(segment, known), *merges, iterations=1, check=False, error=False)
     frames = segment.geometry.video_shape(*merges)[0]
     parts = dict(_without(known))
     total = len(parts) + 2
     bare = _trial(segment, merges, None)
     progress(1, total)
     bandwidth = bare.coefficients / frames
+    # once more, with the bandwidth that all trials share: the search for it would take time and vary
     bare = _trial(segment, merges, bandwidth)
     whole = _trial(calibrated(segment, known), merges, bandwidth)
     progress(2, total)
@@ -85,8 +86,12 @@ class _Trial:
 
 
 def _trial(segment: Segment, merges: tuple[int, int], bandwidth: float | None) -> _Trial:
-    result = reconstruct(segment, *merges, iterations=ITERATIONS, bandwidth=bandwidth, check=False)
+    # no check and no estimate of the error, which would count as time of the iterations
+    result = reconstruct(
+        segment, *merges, iterations=ITERATIONS, bandwidth=bandwidth, check=False, error=False
+    )
     coefficients = int(result.parameters.get("temporal_coefficients", 1))
+    # trials end after different numbers of iterations, so that the time of as many is compared
     seconds = result.seconds / max(result.iterations, 1) * ITERATIONS
     return _Trial(result.quality.prediction, seconds, coefficients)
 

@@ -89,6 +89,7 @@ def energies(segment: Segment) -> tuple[float, float]:
     design = windows[: geometry.lines * geometry.substeps : geometry.substeps].astype(np.float64)
     for arm, (lines, mask) in enumerate(zip(samples, segment.mask, strict=True)):
         pixels = mask.mean(axis=0) > 0.5  # columns without light are masked throughout
+        # only complete lines, so that one design serves all pixels
         rows = mask[:, pixels].all(axis=1)
         good = lines[np.ix_(rows, pixels)]
         if not good.size:
@@ -99,6 +100,7 @@ def energies(segment: Segment) -> tuple[float, float]:
         if len(good) > SPARE_LINES * unknowns:
             fitted, *_ = np.linalg.lstsq(design[rows], good, rcond=None)
             unexplained = good - design[rows] @ fitted
+            # per degree of freedom: noise alone gives its variance
             residual += float(np.square(unexplained).sum() / ((len(good) - unknowns) * good.shape[1]))
     change = residual - noise
     return max(0.0, contrast - noise), change if change > MOVES * noise else 0.0

@@ -114,6 +114,7 @@ class Cluster:
 
     def __init__(self, client: Any) -> None:
         self.workers = max(1, len(client.scheduler_info(n_workers=-1)["workers"]))
+        # not pure: the result of an equal task that was solved before is not reused
         self._executor = client.get_executor(pure=False, retries=2)
         self._lock, self._done = threading.Lock(), 0
 
@@ -177,6 +178,7 @@ def open_pool(
             child.kill()
         raise
     finally:
+        # `shutdown` waits for the tasks in progress, which end at their next iteration
         shared.stop.set()
         executor.shutdown(cancel_futures=True)
 

@@ -73,6 +73,7 @@ def propose(
     parts = [_part(group[i : i + most]) for group in groups for i in range(0, len(group), most)]
     if tile is not None:
         parts = [part.model_copy(update={"why": f"tile {tile}: {part.why}"}) for part in parts]
+    # without a length it goes to the end of the selection
     last = parts.pop().model_copy(update={"substeps": None})
     return ReconstructionPlan(ends="whole" if whole else "trusted", segments=(*parts, last))
 

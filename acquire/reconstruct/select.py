@@ -179,6 +179,7 @@ def along_plan(selection: Selection, plan: ReconstructionPlan, grid: Voxels | No
     stretches, edge = [], begin
     for part, each in zip(plan.segments, voxels, strict=True):
         length = part.length_substeps(geometry.substeps, substep_s)
+        # a segment without a length takes the rest, of at least one sub-step
         if edge + (length or 1) > end:
             wanted, most = (selection.length(to - begin) for to in (edge + (length or 1), end))
             raise UsageError(

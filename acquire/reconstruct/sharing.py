@@ -67,6 +67,7 @@ def liveliest_first(recording: Recording, request: VideoRequest, options: Option
         request.tiles,
         (middle.first_line, middle.lines),
         lambda lines: as_read(lines, options),
+        # a single frame of all lines shows no change
         moving=request.grid.voxels.temporal_merge < middle.lines * request.stream.substeps,
     )
     return (first, *(tile for tile in request.tiles if tile != first))

@@ -127,5 +127,6 @@ def _video_grid(request: VideoRequest, times: Times) -> VideoGrid:
     side, begin_s = grid.voxels.spatial_merge, (grid.begin - times.first_substep) * times.substep_ns * 1e-9
     step = (times.substep_ns * grid.voxels.temporal_merge * 1e-9, float(side), float(side))
     row, column = (request.tiles[0].row, request.tiles[0].column) if request.tiles else (0, 0)
+    # positions are those of the voxels' centres
     middle = (side - 1) / 2
     return VideoGrid(step, (begin_s, row * grid.size + middle, column * grid.size + middle), None)

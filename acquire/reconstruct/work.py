@@ -193,6 +193,7 @@ def solve(task: Task, watch: Watch) -> Part:
                 for name, value in asdict(result.quality).items()
             },
         },
+        # a search that was stopped has not chosen
         choice=Choice.of(result) if result.believed and result.ended != "stopped" else None,
     )
 

@@ -82,6 +82,7 @@ def test_it_is_the_segment_that_the_recording_gives(
         assert tuple(np.ravel(found.responsivity_dn)) == (rig.cameras.a.responsivity_dn,) * 2
         video = glimpses.reconstruct(found)
         assert video.video[video.trusted].shape[0] >= 2
+        assert video.error == "it was not requested"  # nobody would see it
         assert glimpse_message(video, 0.0, 0.1)
 
 

@@ -97,6 +97,7 @@ def _reading(side: str, read: str, shown: str) -> Row:
 
 def _masks(scene: DigitScene) -> dict[tuple[str, str], NDArray[np.bool_]]:
     """Return the voxels covered by each segment that is ever lit, by display and segment."""
+    # share of each voxel of N_m = 3 that a segment covers
     covered = scene.masks.reshape(-1, 64, 3, 64, 3).mean(axis=(2, 4))
     sides = ["left" if display.column < 0.5 else "right" for display, _ in scene.segments]
     return {
@@ -116,6 +117,7 @@ def _peaks(
         for t in range(8, len(light) - 8)
         if light[t] == light[t - 8 : t + 9].max() and light[t] > 0.9 * light.max()
     ]
+    # a plateau of equal light counts once
     kept = [
         t
         for t, before in zip(peaks, [-PERIOD_FRAMES, *peaks], strict=False)

@@ -40,6 +40,7 @@ def figure(studio: Studio) -> PaperFigure:
     seams = [part["begin_substep"] - first for part in outcome.provenance["segments"][1:]]
     times = BEGIN_MS + np.arange(len(video)) * 0.01
     steps, true_steps = (np.sqrt(np.mean(np.diff(each, axis=0) ** 2, axis=(1, 2))) for each in (video, truth))
+    # the sweep itself changes the picture from frame to frame
     excess = steps - true_steps
     jump = max(float(excess[seam - AROUND : seam + AROUND].max()) for seam in seams)
     usual = float(np.quantile(excess, 0.99))

@@ -180,6 +180,7 @@ def _pulses(
     scene, geometry = scene_of(recording), segment.geometry
     assert isinstance(scene, SeparableScene)
     factor = scene.size // geometry.size
+    # a pixel of a coarse sensor sums the light of its fine pixels
     binned = scene.masks[0].reshape(geometry.size, factor, geometry.size, factor).sum(axis=(1, 3))
     image = binned if picture is None else picture
     result = reconstruct(segment, geometry.size, 1, static_image=image)

@@ -34,6 +34,7 @@ def figure(studio: Studio) -> PaperFigure:
     recording = studio.record("scene-window", LINES)
     outcome = studio.stitch(recording, "plan-window", 0, "three sub-segments")
     video = read(outcome)
+    # 2136 + 1972 + 2136
     substeps = 6244
     coarse = true_voxels(recording, 0, substeps, 3, T_OUT)
     fine = true_voxels(recording, 0, substeps, 1, T_OUT)
@@ -46,9 +47,11 @@ def figure(studio: Studio) -> PaperFigure:
     }
     still = video[b].mean(axis=0)
     resolved = last_resolved(contrasts(still, FIELD_MM, GROUPS))
+    # the truth in voxels of N_m = 3, which #A and #C cannot surpass
     open_coarse = last_resolved(
         contrasts(fine[b][0].reshape(54, 3, 54, 3).mean(axis=(1, 3)), FIELD_MM, GROUPS)
     )
+    # 1.8 million sub-steps per second
     frame_ms = T_OUT / 1.8e3
     picks_a = np.linspace(a.start + 110, a.stop - 130, 5).astype(int)
     picks_b = np.linspace(b.start + 20, b.stop - 20, 5).astype(int)

@@ -41,6 +41,7 @@ def figure(studio: Studio) -> PaperFigure:
         for led, theory, found in zip(scene.leds, light, measured, strict=True)
     ]
     times = shot.times_ms
+    # over the circle's period of 1 ms, which is 100 frames
     picks = 250 + np.arange(6) * 17
     return PaperFigure(
         name="fig9",
@@ -107,6 +108,7 @@ def _row(curve: CurveComparison) -> Row:
 def _lines(segment: Segment, start_ms: float) -> Figure:
     drawing = canvas(3.6)
     axes = drawing.subplots(1, 2, sharey=True)
+    # a line has three sub-steps of 10 µs
     extent = (-0.5, 63.5, start_ms + LINES * 0.03, start_ms)
     for ax, lines, name in zip(axes, segment.lines, "AB", strict=True):
         ax.imshow(lines, cmap="gray", aspect="auto", extent=extent)

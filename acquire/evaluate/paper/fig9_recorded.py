@@ -126,6 +126,7 @@ def _lamps(video: NDArray[np.float64], interval_s: float) -> Iterator[Lamp]:
         fit = fit_sine(light, interval_s, harmonics=HARMONICS)
         if fit.amplitude < STEADY * fit.offset:
             fit = fit_constant(light)
+        # a fitted constant has frequency 0, to which only the constant lamp is near
         near = (name for name, hz in LAMPS.items() if abs(fit.frequency_hz - hz) <= NEAR * hz)
         yield Lamp(place, light, fit, next(near, None))
 

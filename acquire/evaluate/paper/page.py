@@ -56,6 +56,7 @@ def draw(figure: PaperFigure, directory: Path, host: Busyness) -> Drawn:
         panels = list(zip(*figure.movie.values(), strict=True))
         enlarged = [beside(each, 1.0, MOVIE_PX) for each in panels]
         write_webp(directory / f"{figure.name}.webp", enlarged)
+        # in their own size: the page enlarges them, and stays small
         clip = clip_of([beside(each, 1.0) for each in panels])
         labels = [f"{frame * figure.movie_ms:.2f} ms" for frame in range(0, len(panels), clip.step)]
     facts = {
