@@ -108,8 +108,8 @@ def test_a_still_with_a_flash_in_front_shows_no_trace_of_the_code(code_seed: int
     still = reconstruct(lines, 3, GEOMETRY.span, "fast", check=False).video
     result = reconstruct(lines, 3, 1, "fast", check=False)
     repeated = np.broadcast_to(still, result.video.shape)
-    # Rounding decides which patterns remain: eight versions of the lines of code 7, of which the samples differ
-    # by 1e-7, are 0 to 2.8 dB below the still.
+    # Rounding decides which patterns remain: eight versions of the lines of code 7, whose samples differ by
+    # 1e-7, are 0 to 2.8 dB below the still.
     assert quality_db("flash", result.video) > quality_db("flash", repeated) - 3.5
     truth = light("flash")[frames].mean((1, 2))
     off = result.video[frames].mean((1, 2)) - truth
