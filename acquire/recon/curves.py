@@ -151,10 +151,11 @@ class CurveFit:
             change = inverse @ (slope - added * before)
             determined = np.clip(1 - added * np.diag(inverse), LEAST_DETERMINED, 1)
             left = energy - 2 * float(change @ slope) + float(change @ gram @ change)
-            self.prior = CurvePrior(
-                (np.square(before + change) / determined).reshape(rank, cosines).mean(0),
-                max(left, FAINTEST * energy) / max(samples - determined.sum(), 1.0),
-            )
+            energies = (np.square(before + change) / determined).reshape(rank, cosines).mean(0)
+            if not energies.max() > np.finfo(np.float32).tiny:
+                break  # the curves are 0, of which no prior can be learnt
+            noise = max(left, FAINTEST * energy) / max(samples - determined.sum(), 1.0)
+            self.prior = CurvePrior(energies, noise)
         exact = self._problem.arrays.exact()
         solver = exact.asarray(inverse)
 

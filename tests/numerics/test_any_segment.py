@@ -115,3 +115,9 @@ def test_lines_that_do_not_determine_the_brightness_are_solved() -> None:
     geometry = Geometry(1, 3, 2)
     segment = damage(record(geometry, 8226, 0.0), "constant", 8226)
     assert np.isfinite(reconstruct(segment, 1, 1, "fast", refuse=False).video).all()
+
+
+def test_curves_of_which_nothing_is_left_are_solved() -> None:
+    """One bright sample among lines below the black level: the video becomes dark, and its curves 0."""
+    segment = damage(record(Geometry(1, 1, 19), 19, 300.0), "one sample", 19)
+    assert np.isfinite(reconstruct(segment, 1, 1, "best", refuse=False).video).all()
