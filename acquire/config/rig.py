@@ -230,8 +230,7 @@ class RigConfig(FrozenModel):
         """A camera delivers whole blocks: until one is full, its arm is silent."""
         if _is_recorded(info):
             return self
-        # Stalls are in the time of the host, in which simulated lines pass `speed` times as fast.
-        passing_hz, most_s = self.line_rate_hz * self.simulation.speed, self.stall_timeout_s / 2
+        passing_hz, most_s = self.passing_hz, self.stall_timeout_s / 2
         if (block_s := self.stream.block_lines / passing_hz) > most_s:
             raise ValueError(
                 f"stream.block_lines cannot be {self.stream.block_lines}: at {passing_hz:g} lines/s such a "
@@ -245,7 +244,7 @@ class RigConfig(FrozenModel):
         """Grabbers that run ahead of everything else must not take all of the processor's time."""
         if _is_recorded(info) or not self.stream.realtime:
             return self
-        passing_hz = self.line_rate_hz * self.simulation.speed
+        passing_hz = self.passing_hz
         fewest = math.ceil(passing_hz / MOST_URGENT_BLOCKS_PER_S)
         if self.stream.block_lines < fewest:
             raise ValueError(
@@ -259,7 +258,7 @@ class RigConfig(FrozenModel):
     def _tags_can_be_read(self, info: ValidationInfo) -> RigConfig:
         if _is_recorded(info):
             return self
-        passing_hz = self.line_rate_hz * self.simulation.speed
+        passing_hz = self.passing_hz
         fewest = math.ceil(passing_hz / MOST_TAGS_PER_S)
         if self.trigger.tag_every_lines < fewest:
             raise ValueError(
@@ -406,3 +405,8 @@ class RigConfig(FrozenModel):
     @property
     def line_rate_hz(self) -> float:
         return self.trigger.clock_hz / self.line_period_ticks
+
+    @property
+    def passing_hz(self) -> float:
+        """Lines per second of the host's time, in which simulated lines pass `speed` times as fast."""
+        return self.line_rate_hz * self.simulation.speed

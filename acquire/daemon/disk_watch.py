@@ -32,7 +32,7 @@ LEAST_S = 5.0
 def disk_watch(config: RigConfig) -> DiskWatch:
     """Return the watch of the rig's directory."""
     line_bytes = config.pixels * np.dtype(config.cameras.a.dtype).itemsize
-    per_s = len(ARMS) * line_bytes * config.line_rate_hz * config.simulation.speed
+    per_s = len(ARMS) * line_bytes * config.passing_hz
     return DiskWatch(config.recording.directory.absolute(), round(config.recording.reserve_gb * 1e9), per_s)
 
 

@@ -87,7 +87,7 @@ class Local:
     async def health(self) -> Health:
         status, config = self._service.status(), self._service.config
         age_s = (datetime.now(UTC) - self._service.armed_since).total_seconds()
-        return health_of(status, config.line_rate_hz * config.simulation.speed, age_s)
+        return health_of(status, config.passing_hz, age_s)
 
     async def version(self) -> Version:
         return version_of(self._service.config)

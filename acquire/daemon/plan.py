@@ -173,7 +173,7 @@ def capture_plan(config: RigConfig, rig: Rig, run_id: str) -> CapturePlan:
         reopen_timeout_s=config.stream.reopen_s,
         columns=config.columns,
         realtime=config.stream.realtime,
-        line_period_ns=1e9 / config.line_rate_hz / config.simulation.speed,
+        line_period_ns=1e9 / config.passing_hz,
         patience_s=config.recording.patience_s,
         goes_on=config.recording.on_disk_trouble == "continue",
         seal_timeout_s=min(config.recording.seal_timeout_s, END_S),

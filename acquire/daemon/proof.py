@@ -65,7 +65,7 @@ class Proof:
             parts = self._parts(progress)
         except (UsageError, DataError) as error:
             log.warning("capacity: it cannot be measured: %s", error)
-            rate_hz = self._config.line_rate_hz * self._config.simulation.speed
+            rate_hz = self._config.passing_hz
             return CapacityStatus(line_rate_hz=rate_hz, warning=f"not measured: {error}")
         load = parts.load
         tight = parts.line_rate_hz * TIGHT < load.line_rate_hz
