@@ -13,6 +13,7 @@ depends on other load: the solver is stopped at the size's processor seconds and
     M = 256, 1024 lines   256 × 256 × 3839    1200 s, 35 dB, 6 GB: ten minutes of two cores
 
 --full-well: electrons at the brightest sample, with 10 electrons of read noise; absent: rounding alone.
+--device gpu: the iterations run there, and the seconds are those of the thread that waits for it.
 """
 
 from __future__ import annotations
@@ -27,6 +28,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from acquire.arrays import DEVICES
 from acquire.cores import limit_threads
 from acquire.evaluate.metrics import psnr
 from acquire.geometry import Geometry
@@ -71,7 +73,7 @@ def case_of(stages: int) -> Case:
     return replace(CASES["fig9"], geometry=Geometry(stages, 3, SIZES[stages].lines))
 
 
-def measure(stages: int, seed: int, full_well_e: float, limit_s: float) -> Row:
+def measure(stages: int, seed: int, full_well_e: float, limit_s: float, device: str) -> Row:
     case = case_of(stages)
     scene, segment = record(case, seed)
     assert isinstance(scene, LedScene)
@@ -85,7 +87,7 @@ def measure(stages: int, seed: int, full_well_e: float, limit_s: float) -> Row:
     watch = threading.Thread(target=_watch, args=(enough, began + limit_s), daemon=True)
     watch.start()
     with limit_threads(1):
-        result = reconstruct(segment, *case.merges, "best", stop=enough)
+        result = reconstruct(segment, *case.merges, "best", stop=enough, device=device)
     processor_s = time.process_time() - began
     enough.set()
     watch.join()
@@ -119,6 +121,7 @@ def main() -> None:
     parser.add_argument("stages", nargs="*", type=int, default=[96, 128], choices=list(SIZES), metavar="M")
     parser.add_argument("--seeds", type=int, nargs="+", default=[201, 202])
     parser.add_argument("--full-well", type=float, default=math.inf)
+    parser.add_argument("--device", default="cpu", choices=list(DEVICES), help="where the iterations run")
     parser.add_argument("--seconds", type=float, help="processor seconds, instead of those of each size")
     add_option(parser)
     options = parser.parse_args()
@@ -129,7 +132,7 @@ def main() -> None:
                 size = SIZES[stages]
                 limit_s = options.seconds or size.limit_s
                 with fresh.Pool(1) as pool:
-                    row = pool.apply(measure, (stages, seed, options.full_well, limit_s))
+                    row = pool.apply(measure, (stages, seed, options.full_well, limit_s, options.device))
                 cost = f"{row.processor_s:.0f} of {limit_s:.0f} s, {row.memory_gb:.2f} GB, {row.ended}"
                 how = f"{row.prior}, {row.cosines} cosines, {row.patterns} patterns"
                 print(

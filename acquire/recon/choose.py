@@ -137,7 +137,7 @@ def _choose(
     if not clear:
         tried.smooth = bench.probe(bench.fitting(SMOOTH), min(at_a_glance, tried.best.error))
         # the first cosine is constant, so that this is the video's mean over time
-        picture = host(cosines.basis.matrix()[0, 0] * cosines.solver.theta[0, ...]).clip(0)
+        picture = (cosines.basis.matrix()[0, 0] * host(cosines.solver.theta[0, ...])).clip(0)
         tried.bright = bench.brighten(picture, cosines.basis.count, min(at_a_glance, tried.best.error))
     ahead, refined = at_a_glance <= OUTDONE * tried.best.error, None
     if ahead:

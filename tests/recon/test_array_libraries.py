@@ -29,6 +29,7 @@ from acquire.recon.basis import TemporalBasis
 from acquire.recon.patterns import ROUND, Refinement, find_patterns
 from acquire.recon.problem import build_problem
 from acquire.recon.tv import FrameTv
+from acquire.sim.procedural import record
 
 GEOMETRY = Geometry(16, 3, 80)
 DEVICE = array_api_strict.Device("device1")
@@ -147,6 +148,17 @@ def test_every_stage_of_the_default(device: str, segment: Segment) -> None:
         assert "patterns" in result.parameters
         assert result.video.dtype == np.float32
         assert error(result) < 0.2
+
+
+@pytest.mark.parametrize("scene", ["flicker", "leds"])
+def test_every_trial_of_the_choice(device: str, scene: str) -> None:
+    """Still, volumes, free brightness and a glance at the cosines: the choice is the same everywhere."""
+    given = record(scene, 3, stages=8, lines=60)
+    here, there = (
+        reconstruct(given.segment, 2, 1, "fast", dtype="float64", device=on) for on in ("cpu", device)
+    )
+    assert there.parameters["prior"] == here.parameters["prior"]
+    assert difference(there, here) < 0.02
 
 
 def test_patterns_and_curves(segment: Segment) -> None:
