@@ -152,20 +152,30 @@ class Admm:
         ------
         NumericsError : the iterates are not finite
         """
+        # In place wherever the old value is not needed: these arrays are larger than the caches, so that
+        # each temporary one costs as much as the sum that it holds. What others may hold is replaced.
         relaxation = self._parameters.relaxation
-        relaxed = relaxation * self._data_step() + (1 - relaxation) * self.theta
+        relaxed = self._data_step()
+        relaxed *= relaxation
+        relaxed += (1 - relaxation) * self.theta
+        values = self._xp.tensordot(self._grid.T, relaxed, axes=1)
         self.theta = self._denoiser.prox(relaxed + self._tv_multiplier, self._strength)
-        self._tv_multiplier += relaxed - self.theta
-        values = self._xp.tensordot(self._grid.T, relaxed, axes=1) + self._sign_multiplier
+        relaxed -= self.theta
+        self._tv_multiplier += relaxed
+        values += self._sign_multiplier
         self._sign = self._xp.maximum(values, self._least)
-        self._sign_multiplier = values - self._sign
+        values -= self._sign
+        self._sign_multiplier = values
 
     def _data_step(self) -> Array:
         p = self._parameters
         rho = p.tv_penalty + p.sign_penalty
         # the grid's rows are orthonormal, so that both splits together are one ρ/2·‖θ − centre‖²
-        centre = p.tv_penalty * (self.theta - self._tv_multiplier)
-        centre += p.sign_penalty * self._xp.tensordot(self._grid, self._sign - self._sign_multiplier, axes=1)
+        centre = self.theta - self._tv_multiplier
+        centre *= p.tv_penalty
+        signed = self._xp.tensordot(self._grid, self._sign - self._sign_multiplier, axes=1)
+        signed *= p.sign_penalty
+        centre += signed
         centre /= rho
         # y − W·B·c − (W·B·BᵀW + ρ)·w, with a single product, since `_lifted` is BᵀW·w
         residual = self._samples - self._operator.forward(centre + self._lifted) - rho * self._w
@@ -174,7 +184,8 @@ class Admm:
                 "ADMM diverged: its iterates are not finite", hint="check the segment's samples and weights"
             )
         self._descend(residual, rho)
-        return centre + self._lifted
+        centre += self._lifted
+        return centre
 
     def _descend(self, residual: Array, rho: float) -> None:
         """Make conjugate-gradient steps on (W·B·BᵀW + ρ)·w; ``residual`` is overwritten."""
@@ -192,7 +203,8 @@ class Admm:
                 return
             length = energy / curvature
             self._w += length * direction
-            self._lifted += length * lifted
+            lifted *= length
+            self._lifted += lifted
             residual -= length * image
             scaled = self._precondition(residual)
             energy, before = dot(residual, scaled), energy

@@ -198,14 +198,19 @@ def staircase(
     lit: NDArray[Any], starts: NDArray[np.int64], lengths: NDArray[np.int64], geometry: Geometry
 ) -> NDArray[Any]:
     """Σ_d m(d)·lit[i·S + start_q + d] for every line i and row block q: (L_R, n′, K)."""
-    S = geometry.substeps
+    S, K = geometry.substeps, lit.shape[1]
     first = np.arange(geometry.lines)[:, None] * S
-    factor = np.zeros((geometry.lines, len(starts), lit.shape[1]), lit.dtype)
+    factor = np.empty((geometry.lines, len(starts), K), lit.dtype)
     # the last block may be shorter, and has other multiplicities then
     for length in np.unique(lengths):
-        blocks = np.flatnonzero(lengths == length)
-        for d in range(length + S - 1):
+        steps = length + S - 1
+        # The sum depends on line and block only through the sub-step where it begins, and there are about n′
+        # times fewer of those: they are summed once, and then copied.
+        sums = np.zeros((len(lit) - steps + 1, K), lit.dtype)
+        for d in range(steps):
             # in lit's dtype: one of numpy's int64 would make the products float64
             multiplicity = lit.dtype.type(min(d + 1, length, S, length + S - 1 - d))
-            factor[:, blocks] += multiplicity * lit[first + starts[blocks] + d]
+            sums += multiplicity * lit[d : d + len(sums)]
+        blocks = np.flatnonzero(lengths == length)
+        factor[:, blocks] = sums[first + starts[blocks]]
     return factor
