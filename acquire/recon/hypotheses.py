@@ -196,6 +196,7 @@ class LineModel:
         code = self._bits(substeps * self.first - late, span).astype(np.float64)
         if random_code:
             code = np.random.default_rng(random_code).integers(0, 2, span).astype(np.float64)
+        # a multiple of the pixels, since the arms exchange rows and pixels
         finer = max(1, min(rows, MOST_BLOCKS) // self.pixels)
         lit = 1 - code if inverted else code
         return Response(lit, rows, substeps, self.lines, self.pixels, finer)

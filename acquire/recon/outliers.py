@@ -45,6 +45,7 @@ def outliers(samples: NDArray[Any], mask: NDArray[np.bool_]) -> dict[str, NDArra
 def _spikes(samples: NDArray[np.float64], left: NDArray[np.bool_]) -> NDArray[np.bool_]:
     if samples.shape[1] < SPIKE_LINES or not left.any():
         return np.zeros_like(left)
+    # along lines only: neighbouring lines share their light, neighbouring columns need not
     deviation = np.abs(samples - median_filter(samples, size=(1, SPIKE_LINES, 1), mode="nearest"))
     # standard deviation of normal noise with this median
     spread = 1.4826 * np.median(deviation[left])
@@ -56,6 +57,7 @@ def _hot(samples: NDArray[np.float64], left: NDArray[np.bool_]) -> NDArray[np.bo
     if samples.shape[1] < FEWEST_LINES:
         return np.zeros_like(left)
     medians = np.median(np.abs(samples), axis=1, keepdims=True)
+    # of nearly all columns, not of the middle one: most of a scene may be dark
     usual = np.quantile(medians, 0.9, axis=2, keepdims=True)
     return np.asarray(np.broadcast_to((medians > HOT_RATIO * usual) & (usual > 0), samples.shape))
 

@@ -163,6 +163,7 @@ class Stream:
         for before, after in pairwise(stretches):
             if before.end != after.begin:
                 raise UsageError(f"a stretch ends at sub-step {before.end}, the next begins at {after.begin}")
+        # 0 for slow ones: no seam with them fades
         lengths = [
             0 if self.is_slow(stretch.voxels) else stretch.end - stretch.begin for stretch in stretches
         ]
@@ -244,6 +245,7 @@ class Grid:
         have, want = segment.voxels.spatial_merge, self.voxels.spatial_merge
         if have == want:
             return timed
+        # the last voxel of a side may be narrower
         edges = [np.append(np.arange(0, self.size, merge), self.size) for merge in (have, want)]
         # one axis after the other, since voxels are products of intervals
         rows = _means(np.moveaxis(timed, 1, 0), *edges)  # (row, t, column)
@@ -275,6 +277,7 @@ def _rise(edges: NDArray[np.int64], seam: int, fade: int) -> NDArray[np.float64]
 
 def _means(values: NDArray[np.float32], have: NDArray[np.int64], want: NDArray[np.int64]) -> NDArray[Any]:
     """Means over ``want[i] .. want[i+1]`` of values held over ``have[j] .. have[j+1]``, along axis 0."""
+    # a matrix with a row for each of ``want`` and a column for each of ``have``
     low, high = np.maximum.outer(want[:-1], have[:-1]), np.minimum.outer(want[1:], have[1:])
     overlap = np.maximum(high - low, 0).astype(np.float32)
     total = overlap.sum(axis=1, keepdims=True)
