@@ -30,6 +30,7 @@ def balance_of_recording(
 
     A balance in the calibration takes precedence; a warning is given if the lines contradict it.
     """
+    # as they will be solved: what a calibration and a turn of the arms leave of a difference
     segments = [as_read(each, options) for each in _sample_segments(recording)]
     found = balance_of(segments)
     if found is None:
