@@ -114,8 +114,10 @@ def _columns(found: Finding, known: Calibration, name: str, unit: str) -> Iterat
         good &= known.usable
     change: NDArray[np.float64] = np.where(good, now.value - before.value, 0.0)
     sure = np.hypot(now.uncertainty, before.uncertainty)
-    # the most significant change, which need not be the largest
-    at = np.unravel_index((np.abs(change) - SURE * sure).argmax(), change.shape)
+    # the change that exceeds its own limit (`Compared.holds`) by most; it need not be the largest, and a
+    # small one beyond doubt must not hide it
+    limit = np.maximum(MATTERS[name], SURE * sure)
+    at = np.unravel_index((np.abs(change) - limit).argmax(), change.shape)
     yield Compared(name, unit, float(change[at]), float(sure[at]), MATTERS[name])
 
 

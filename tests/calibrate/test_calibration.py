@@ -14,6 +14,7 @@ from instruments import NOISE, dots, record, white
 
 from acquire.calibrate import Calibration, Measured, calibrated, open_calibration, save_calibration
 from acquire.calibrate.apply import check_fits
+from acquire.calibrate.calibration import Finding
 from acquire.calibrate.check import check
 from acquire.calibrate.columns import dark
 from acquire.calibrate.exposure import open_exposure
@@ -204,6 +205,26 @@ def test_changes_are_reported(tmp_path: Path, recordings: dict[str, Path], whole
         found = check(open_exposure(record(tmp_path / f"{light}.zarr", scene, light)), whole)
         assert not found.holds
         assert quantity in {each.quantity for each in found.compared if not each.holds}
+
+
+def test_a_certain_small_change_does_not_hide_a_large_one(
+    monkeypatch: pytest.MonkeyPatch, recordings: dict[str, Path], whole: Calibration
+) -> None:
+    """Columns differ in their uncertainty: one that is beyond doubt need not be the one that matters."""
+    before = whole.quantities["offset_dn"]
+    value, uncertainty = before.value.copy(), np.zeros_like(before.value)
+    value[0, 3] += 0.45
+    value[1, 5] += 0.6
+    uncertainty[1, 5] = 0.1
+    exact = replace(
+        whole, quantities={**whole.quantities, "offset_dn": Measured(before.value, np.zeros_like(value))}
+    )
+    exposure = open_exposure(recordings["dark"])
+    now = Finding("dark", whole.instrument, {"offset_dn": Measured(value, uncertainty)})
+    monkeypatch.setattr("acquire.calibrate.check.dark", lambda *_, **__: now)
+    found = check(exposure, exact)
+    assert not found.holds
+    assert found.compared[0].change == pytest.approx(0.6)
 
 
 def test_a_turned_camera_is_reported(tmp_path: Path, whole: Calibration) -> None:
