@@ -198,12 +198,14 @@ def moments(exposure: Exposure, progress: Progress = no_progress) -> Moments:
     # Every block has a mean of its own, so drift does not count as noise; that costs it a degree of freedom.
     mean, variance = pooled(means, counts), pooled(variances, (counts - 1).clip(0))
     errors = np.sqrt(variance / counts.clip(1)[:, :, None]).clip(1e-9)
+    # a block of which no line arrived has no mean that could differ
+    apart = np.where(counts[:, :, None] > 0, np.abs(means - mean) / errors, 0.0)
     return Moments(
         lines=total,
         mean=mean,
         variance=variance,
         own_variance=pooled(own, (counts - 1).clip(0)),
-        drift=np.abs((means - mean) / errors).max(axis=0) if len(parts) > 1 else np.zeros_like(mean),
+        drift=apart.max(axis=0) if len(parts) > 1 else np.zeros_like(mean),
         at_zero=pooled(zeros, counts),
         saturated=pooled(saturated, counts),
     )
@@ -221,12 +223,14 @@ def _block_moments(
     mean, variance, own, zeros, saturated = found
     for arm, here in enumerate(arrived):
         samples = lines[arm, here]
-        if len(samples) < 2:
+        if not len(samples):
             continue
         mean[arm] = samples.mean(axis=0)
-        variance[arm] = samples.var(axis=0, ddof=1)
-        own[arm] = _own_variance(samples, mean[arm])
         zeros[arm], saturated[arm] = (samples == 0).mean(axis=0), (samples >= white[arm]).mean(axis=0)
+        # a single line has no variance, and no weight in that of all
+        if len(samples) > 1:
+            variance[arm] = samples.var(axis=0, ddof=1)
+            own[arm] = _own_variance(samples, mean[arm])
     return counts, *found
 
 
