@@ -237,6 +237,7 @@ class Calibration:
             quantities={**self.quantities, **found.quantities},
             # from all steps anew: a step that is repeated can make columns usable again
             usable=_usable(steps, self.instrument.columns),
+            # one that was not clear is None, and replaces nothing
             orientation=found.orientation or self.orientation,
             alignment=found.alignment or self.alignment,
             steps=steps,
@@ -315,6 +316,7 @@ class Calibration:
                     TileAlignment(
                         str(e["tile"]), (int(e["seen_from"][0]), int(e["seen_from"][1])), _alignment(e)
                     )
+                    # calibrations from before tiles were aligned have none
                     for e in attrs.get("tiles", ())
                 ),
             )

@@ -97,7 +97,7 @@ def check(exposure: Exposure, known: Calibration, *, covered: bool = False) -> C
         except UsageError as error:  # many targets have no edges that show the blur
             doubts += (f"the optics' blur was not compared: {error.message}",)
     found = orientation(exposure, known)
-    expected = known.orientation or "turn 90"
+    expected = known.orientation or "turn 90"  # `MODEL`, if none was measured
     if found.orientation is None or found.orientation != expected:
         result = "is not clear" if found.orientation is None else f"is {found.orientation!r}"
         doubt = f"the orientation {result}; the calibration has {expected!r}"
@@ -133,8 +133,10 @@ def _balance(found: Finding, known: Calibration) -> Iterator[Compared]:
 def _alignment(found: Finding, known: Calibration) -> Iterator[Compared]:
     assert found.alignment is not None  # `alignment` returns one or raises
     before, now = known.alignment, found.alignment
+    # without an alignment, a reconstruction takes the arms to coincide
     then = before.alignment.facts() if before else {"magnification": 1.0}
     errors = before.uncertainty if before else {}
+    # a magnification is compared by what it displaces at the field's edge
     half = known.instrument.stages * known.instrument.substeps / 2
     scales = {"rows": (1.0, "pixels"), "columns": (1.0, "pixels"), "turn_deg": (1.0, "turn_deg")}
     for name, (scale, kind) in (scales | {"magnification": (half, "pixels")}).items():

@@ -96,6 +96,7 @@ def beyond(exposure: Exposure) -> tuple[Beyond, Beyond]:
     parts = []
     for segment in exposure.blocks():
         sums = segment.lines.sum(axis=2, dtype=np.float64)
+        # a line that lacks columns has less light for another reason than its delay
         parts.append(np.where(segment.mask.all(axis=2), sums, np.nan))
     geometry = exposure.recording.geometry_for(1)
     found = []

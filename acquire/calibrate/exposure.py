@@ -79,6 +79,7 @@ class Exposure:
 
     def samples(self) -> Iterator[tuple[NDArray[Any], NDArray[np.bool_]]]:
         """Yield the samples (arm, line, column) of all columns, lit or not, and which are usable."""
+        # behind a fibre a cut segment has one tile's columns; the steps measure all
         if self.recording.fibre is None:
             yield from ((block.lines, block.mask) for block in self.blocks())
             return
@@ -177,6 +178,7 @@ def no_progress(done: int, total: int) -> None:
 
 def moments(exposure: Exposure, progress: Progress = no_progress) -> Moments:
     """Compute the statistics of an exposure. Raises UsageError if an arm has no usable line."""
+    # samples are whole numbers
     white = np.ceil(exposure.camera("white_dn"))[:, None, None]
     parts: list[tuple[NDArray[Any], ...]] = []
     done = 0
