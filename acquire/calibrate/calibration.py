@@ -311,7 +311,7 @@ class Calibration:
                 usable=None if usable is None else np.asarray(usable, np.bool_),
                 orientation=attrs["orientation"],
                 alignment=None if found is None else _alignment(found),
-                steps={name: dict(step) for name, step in attrs["steps"].items()},
+                steps={name: _step(step) for name, step in attrs["steps"].items()},
                 tiles=tuple(
                     TileAlignment(
                         str(e["tile"]), (int(e["seen_from"][0]), int(e["seen_from"][1])), _alignment(e)
@@ -339,6 +339,13 @@ def _usable(steps: Mapping[str, dict[str, Any]], columns: int) -> NDArray[np.boo
         for row, arm in zip(usable, ARMS, strict=True):
             row[each.get(arm, [])] = False
     return usable
+
+
+def _step(attrs: Mapping[str, Any]) -> dict[str, Any]:
+    # a moment without a zone cannot be compared with a recording's
+    if "made" in attrs and datetime.fromisoformat(attrs["made"]).tzinfo is None:
+        raise ValueError(f"a step was made at {attrs['made']}, in no time zone")
+    return dict(attrs)
 
 
 def _alignment(attrs: Mapping[str, Any]) -> AlignmentFound:

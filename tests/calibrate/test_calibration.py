@@ -95,6 +95,9 @@ def test_anything_but_a_calibration_is_neither_read_nor_replaced(
     [
         ("instrument", {}),
         ("steps", 3),
+        ("steps", {"dark": {"made": "yesterday"}}),
+        ("steps", {"dark": {"made": "2026-01-31T12:00:00"}}),
+        ("steps", {"dark": {"made": 20260131}}),
         ("alignment", {"rows": "much"}),
         ("usable", [[True]]),
         ("usable", "x"),
