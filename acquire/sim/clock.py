@@ -299,12 +299,14 @@ class Wire:
 
 
 def _encode(train: PulseTrain) -> bytes:
+    # fractions as text: as JSON's floats, pulses would not be exact
     timing = (train.run, train.start_ns, str(train.line_period_ns), str(train.speed), dict(train.code))
     limits = (train.stopped_after, train.budget)
     return json.dumps([*timing, *limits, dict(train.settled_s), train.lit_part]).encode()
 
 
 def _receive(duplicate: Any) -> Wire:
+    # not `Wire()`, which would make a page of its own
     wire = Wire.__new__(Wire)
     wire._attach(duplicate.detach(), HostClock())
     return wire

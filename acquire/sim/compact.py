@@ -50,6 +50,7 @@ class SideBySide:
         self._delivered = 0
         first, *others = self._parts
         first.arm()
+        # from the same pulse, although one may come while the parts are armed
         for part in others:
             part.arm_like(first)
 
@@ -80,6 +81,7 @@ class SideBySide:
         for column, block in zip(self._opener.first_columns, blocks, strict=True):
             skip = first_line - block.first_line
             pixels[:, column : column + block.pixels.shape[1]] = block.pixels[skip : skip + count]
+            # what is wrong with a line of one image is wrong with the sensor's line
             flags |= block.flags[skip : skip + count]
         return CameraBlock(first_line, pixels, flags)
 

@@ -66,11 +66,13 @@ def chop(
     for i in range(frames.shape[0]):
         for r in range(frames.shape[1]):
             for c in range(frames.shape[2]):
+                # nothing to cover, and the angle takes far longer than the comparison
                 if frames[i, r, c] == 0:
                     continue
                 x = (angle[r, c] - turned[i]) * blades
                 x -= np.floor(x)
                 inside = min(x, open_part - x) if x < open_part else -min(x - open_part, 1 - x)
+                # an arc from the nearest edge, in pixels
                 distance = inside / blades * 2 * np.pi * radius[r, c]
                 frames[i, r, c] *= min(1.0, max(0.0, 0.5 + distance))
 
@@ -119,6 +121,7 @@ def follow(target: NDArray[Any], rise: float, fall: float, level: NDArray[Any], 
     for k in range(target.shape[0]):
         for t in range(target.shape[1]):
             tau = rise if target[k, t] > level[k] else fall
+            # the target is constant within a step: this is the exact solution and its mean, at any tau
             left = np.exp(-1 / tau)
             out[k, t] = target[k, t] + (level[k] - target[k, t]) * tau * (1 - left)
             level[k] = target[k, t] + (level[k] - target[k, t]) * left

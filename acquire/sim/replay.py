@@ -187,6 +187,7 @@ class ReplayCamera:
         position = self._delivered
         self._delivered += count
         while position < self._delivered:
+            # the first pulses read out what was on the sensor before line 0
             line, left = position - self._depth_lines, self._delivered - position
             if line < 0:
                 pixels, flags = self._dark(min(-line, left))
@@ -216,6 +217,7 @@ class ReplayCamera:
             start, stop = page * _PAGE_LINES, min((page + 1) * _PAGE_LINES, self._rows)
             flags = flags_of(self._recording, self._opener.arm, start, stop)
             pixels = present_values(self._recording, self._opener.arm, "lines", start, flags)
+            # in the host's byte order, as a camera's samples; a recording has the format's
             self._page = (page, pixels.astype(self._stream.dtype.newbyteorder("=")), flags)
         _, pixels, flags = self._page
         part = slice(skip, skip + count)

@@ -88,6 +88,7 @@ class RtlTransport(SerialTransport):
         self._process = _spawn(clock_hz, pins)
         try:
             super().__init__(_first_report(self._process)["port"], baud(clock_hz))
+        # also of Ctrl-C: nothing else would end the process before its owner does
         except BaseException:
             _end(self._process)
             raise

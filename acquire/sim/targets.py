@@ -112,6 +112,7 @@ def usaf_picture(
 
 def overlap(size: int, begin: float, length: float) -> NDArray[np.float64]:
     """Return the fraction of each of ``size`` equal pixels of 0 … 1 that begin … begin + length covers."""
+    # clipped to the bar, each pixel's two edges are as far apart as they are covered
     edges = np.clip(np.arange(size + 1) / size, begin, begin + length)
     return np.diff(edges) * size
 

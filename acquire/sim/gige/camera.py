@@ -162,6 +162,7 @@ class GigeCamera:
         significant, stored = next((used, bits) for at, used, bits in PIXEL_FORMATS.values() if at == code)
         samples = lines[:, offset : offset + width]
         excess = self._bits - significant
+        # the sensor's most significant bits, as a camera with fewer bits sends them
         samples = samples >> excess if excess > 0 else samples << -excess
         data = samples.astype("<u2" if stored == 16 else "u1").tobytes()
         transmission = self.transmission
@@ -181,6 +182,7 @@ class GigeCamera:
         self._frames += 1
 
     def _put(self, packets: Iterable[bytes]) -> None:
+        # the upper half of the register holds other fields of the standard
         port = self._registers.get(protocol.STREAM_PORT) & 0xFFFF
         host = socket.inet_ntoa(struct.pack(">I", self._registers.get(protocol.STREAM_ADDRESS)))
         for packet in packets:

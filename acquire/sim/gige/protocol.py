@@ -76,6 +76,7 @@ def parse_resend(request: Request) -> tuple[int, int, int]:
         first, last, number = struct.unpack(">4xIIQ", request.body[:20])
     else:
         number, first, last = struct.unpack(">III", request.body[:12])
+    # packet ids have 24 bits
     return number, first & 0xFF_FFFF, last & 0xFF_FFFF
 
 
