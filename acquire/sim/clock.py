@@ -36,7 +36,7 @@ from acquire.codes import code_from_attrs
 from acquire.errors import DeviceError, UsageError
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
+    from collections.abc import Callable, Iterator, Mapping
 
     from acquire.codes import Code
 
@@ -148,6 +148,16 @@ class Reading:
         return self.train is not None and self.train.stopped_after is None
 
 
+def attempts() -> Iterator[None]:
+    """Yield for every attempt to read what another process writes, until its writer must have died."""
+    # The host's own time: a clock that a test advances stands still while this waits.
+    deadline_ns, nap_s = time.monotonic_ns() + int(_TORN_S * 1e9), _WRITE_S
+    while time.monotonic_ns() < deadline_ns:
+        yield
+        time.sleep(nap_s)
+        nap_s = min(2 * nap_s, _LONGEST_WRITE_S)
+
+
 class Wire:
     """One trigger's pulses, visible to every process that was given the wire when it was spawned.
 
@@ -255,9 +265,7 @@ class Wire:
 
     def _observe(self) -> tuple[int, Reading]:
         """Return a sequence number and the reading that belongs to it."""
-        # The host's own time: a clock that a test advances stands still while this waits.
-        deadline_ns, nap_s = time.monotonic_ns() + int(_TORN_S * 1e9), _WRITE_S
-        while time.monotonic_ns() < deadline_ns:
+        for _ in attempts():
             sequence = self._sequence()
             # Readers take no lock: the sequence is odd while a train is being written, and a reading is valid
             # only if the sequence is the same afterwards. The clock is read in between; otherwise a reader
@@ -266,8 +274,6 @@ class Wire:
                 train, now_ns = self._known[1], self.clock.monotonic_ns()
                 if self._sequence() == sequence == self._known[0]:
                     return sequence, Reading(train, 0 if train is None else train.issued(now_ns))
-            time.sleep(nap_s)
-            nap_s = min(2 * nap_s, _LONGEST_WRITE_S)
         raise DeviceError("the simulated trigger died while it was writing to the wire")
 
     def _sequence(self) -> int:
