@@ -64,6 +64,7 @@ def band(runs: Sequence[Run], name: str, clock: Clock = "seconds") -> Band | Non
             stairs.append(np.array(sorted(steps)))
     if not stairs:
         return None
+    # before that, the median would be one of fewer repeats
     begin = max(each[0, 0] for each in stairs)
     times_s = np.unique(np.concatenate([[begin], *(each[:, 0] for each in stairs)]))
     times_s = times_s[times_s >= begin]
@@ -84,6 +85,7 @@ def knees(curve: Band, *, ended: bool) -> list[Knee]:
     flat = -math.inf
     for seconds in map(float, curve.times_s):
         last = 2 * seconds > end
+        # of a run that was cut nobody knows what the same time again would have given
         if last and not ended:
             break
         value = curve.at(seconds)

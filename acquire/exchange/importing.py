@@ -105,6 +105,7 @@ def clock_of(line_rate_hz: float, substeps: int) -> tuple[int, int]:
     """Return ticks per second and per sub-step of a clock for a line rate, to a part in 10⁸ or better."""
     ticks = SUBSTEP_TICKS
     while line_rate_hz * substeps * ticks < 1e8:
+        # integers: more ticks per sub-step make the rounding of the rate smaller
         ticks *= 10
     return round(line_rate_hz * substeps * ticks), ticks
 

@@ -49,6 +49,7 @@ def write_movie(
     """Write a movie of ``fps`` frames per second, grey from 0 to ``peak`` (None: close to the brightest)."""
     av = library("av", "video", "an MP4 file")
     white = peak or _white(content)
+    # by an integer, so that pixels stay equal squares
     times = max(1, USUAL_SIDE // max(content.image.shape[1:]))
     height, width = (side * times for side in content.image.shape[1:])
     known = {"left_out": [each.name for each in content.beside]} if content.beside else {}
