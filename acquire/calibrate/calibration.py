@@ -58,21 +58,21 @@ QUANTITIES = {
     "offset_dn": Quantity(COLUMN, "DN", "of a pixel under a dark code"),
     "noise_dn": Quantity(COLUMN, "DN", "temporal standard deviation of a dark pixel"),
     "ambient_dn": Quantity(COLUMN, "DN", "added by light that no code switches"),
-    "gain": Quantity(COLUMN, "1", "response beside the mean of the arm's columns"),
-    "balance": Quantity(ARM, "1", "response of the arm beside the mean of both"),
+    "gain": Quantity(COLUMN, "1", "response relative to the mean of the arm's columns"),
+    "balance": Quantity(ARM, "1", "response of the arm relative to the mean of both"),
     "dn_per_electron": Quantity(ARM, "DN", "system gain K of EMVA 1288"),
     "read_noise_e": Quantity(ARM, "electron", "temporal dark noise of EMVA 1288"),
     "full_well_e": Quantity(ARM, "electron", "saturation capacity of EMVA 1288"),
     "light_late_ticks": Quantity(
         ARM,
         "1",
-        "by which light comes after the charge's moves without lead and delays, in the trigger's ticks",
+        "delay of the light after the charge transfer, without lead and delays, in the trigger's ticks",
     ),
     "blur_px": Quantity(
         WIDTHS, "1", "standard deviation of the optics' blur along the transfer and across it, in fine pixels"
     ),
     "linearity_error": Quantity(ARM, "1", "linearity error of EMVA 1288"),
-    "excess_dn": Quantity(CURVE, "DN", "by which samples are too high that read 0 … white, evenly"),
+    "excess_dn": Quantity(CURVE, "DN", "excess of samples that read 0 … white, at evenly spaced knots"),
 }
 
 FOUND_BY = {

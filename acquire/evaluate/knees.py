@@ -85,7 +85,7 @@ def knees(curve: Band, *, ended: bool) -> list[Knee]:
     flat = -math.inf
     for seconds in map(float, curve.times_s):
         last = 2 * seconds > end
-        # of a run that was cut nobody knows what the same time again would have given
+        # for a run that was cut, the gain of doubling the time is unknown
         if last and not ended:
             break
         value = curve.at(seconds)

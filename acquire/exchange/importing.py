@@ -222,7 +222,7 @@ def shifted(code: Code, start: int) -> Code:
 
 def _unknown(arms: Mapping[str, Arm], instrument: Instrument) -> list[str]:
     """List what is not known about the lines. The texts are stored in the recording."""
-    found = ["the trigger's tags: code and time of every line follow from what was said at the import"]
+    found = ["the trigger's tags: code and time of every line follow from the arguments of the import"]
     found.append("lines that were lost before: a loss shifts the code of all that follow")
     if instrument.start_ns is None:
         found.append("UTC: the first line's is taken as 1970-01-01T00:00:00")

@@ -217,7 +217,7 @@ def _search(bench: Workbench, tried: _Tried, trials: int, rival: float) -> Trial
             volume = volume.bench.follow_brightness(volume)
     if smooth.error < FAR * min(volume.error, rival):
         smooth = bench.climb(smooth, trials)
-    # beyond chance, which is worth 5 dB where something flashes; not asked of other volumes, because ten
+    # beyond chance, which is worth 5 dB where something flashes; not required of other volumes, since ten
     # blocks reject some of these that are 2 dB better
     flows = smooth.error < SMOOTHER * volume.error and bench.held_out.clearly_less(
         smooth.errors, still.errors

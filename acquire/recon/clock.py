@@ -148,7 +148,7 @@ class IterationClock:
         last = min(self.done + most, self.iterations)
         expected, before = self.longest_s, self._recent_s
         if stage != self._stage:
-            # a stage that goes on knows its longest iterations; a new one has others
+            # a stage that continues has measured its iterations; those of a new one are different
             expected, self._recent_s = first * expected, deque(maxlen=REMEMBERED)
         while self.done < last and self._may_continue(expected, share):
             begun = self.seconds

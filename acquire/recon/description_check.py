@@ -42,7 +42,7 @@ def check_description(segment: Segment, quality: Quality, clock: IterationClock)
     if not residual > SUSPICIOUS or not clock.affords(SECONDS):
         return DescriptionCheck()
     found = diagnose(segment)
-    # some right descriptions are unclear: what cannot be told is no contradiction
+    # some right descriptions are unclear: what is uncertain is not a contradiction
     believed = found.standing in (Standing.RIGHT, Standing.UNCLEAR)
     words = found.sentences
     if found.standing is Standing.RIGHT and residual > POOR_MISFIT:

@@ -227,7 +227,7 @@ def measure_indicators(
     scale = full_scale(shown)
     if not (scale > 0 and residual > 0):
         return None
-    # ratios and logarithms are taken of what follows: none of it may be 0
+    # what follows enters ratios and logarithms, so that none of it may be 0
     floor = exponents.floor * scale
     change, edge = shown - shown.mean(0), np.zeros_like(shown)
     edge[:, :-1] += np.square(np.diff(shown, axis=1))

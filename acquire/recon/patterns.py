@@ -108,7 +108,7 @@ def find_patterns(theta: NDArray[Any], *, beyond_doubt: bool = False) -> Pattern
     if not _is_enough(rank, energy, LARGEST_REST_AT_GAP):
         if beyond_doubt:
             return None
-        # Noise has most of the singular values to itself, and a share of each; of few it cannot be told.
+        # Noise has most of the singular values to itself, and a share of each; few do not determine it.
         noise = np.median(energy) if count >= LEAST_FOR_NOISE else 0.0
         rank = _above_floor(energy[:TAIL], noise)
         if not _is_enough(rank, energy - noise, LARGEST_REST):

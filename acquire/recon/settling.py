@@ -2,7 +2,7 @@
 
     doubtful patterns on trial ─▶ λ is lowered until noise is fitted ─▶ those left on trial ─▶ λ is held
 
-The first look tells patterns from its own errors by their energy alone, and may find too many. Superfluous
+The first look distinguishes patterns from its own errors only by energy, and may find too many. Superfluous
 ones fit noise: the picture loses 2 to 10 dB while the lines are explained. The held-out samples end the
 refinement, and the round that predicted them best is the result: at full resolution there is no model error
 to fit, so that they are predicted better as long as the picture improves. Next to the noise they rise and

@@ -51,7 +51,7 @@ def balance_of_recording(
 def _sample_segments(recording: Recording) -> Iterator[Segment]:
     """Cut ranges spread over the available lines, and behind a fibre over its tiles.
 
-    Ranges that cannot be cut are skipped: whoever asks for their lines gets the error.
+    Ranges that cannot be cut are skipped: reading their lines raises the error.
     """
     first, end = recording.first_available_line, recording.first_line + recording.lines
     tiles: tuple[Tile | None, ...] = (None,) if recording.fibre is None else recording.fibre.tiles

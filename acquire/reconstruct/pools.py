@@ -176,7 +176,7 @@ def open_pool(
     )
     try:
         yield Processes(executor, count, shared)
-    except KeyboardInterrupt:  # nobody needs the tasks in progress any more
+    except KeyboardInterrupt:  # the tasks in progress are no longer needed
         for child in multiprocessing.active_children():
             child.kill()
         raise
