@@ -180,7 +180,14 @@ class Workbench:
         self._brightness: NDArray[Any] | None = None  # of the next trials; a trial keeps its own
         self._bright_cosines = self.frames
         self._operators: dict[tuple[int, bool], Operator] = {}  # successive trials mostly share one
-        self._response = self._voxel_energy() / USUAL_ENERGY
+
+        # energy of the normalised lines' response to steady light in the voxel in the middle of the picture
+        constant = TemporalBasis(self.frames, 1, problem.arrays)
+        point = np.zeros((1, self._side, self._side))
+        point[0, self._side // 2, self._side // 2] = 1
+        lines = host(self._operator(constant, None).forward(problem.arrays.asarray(point)))
+        energy = float(np.square(lines / problem.norm, dtype=np.float64).sum()) or USUAL_ENERGY
+        self._response = energy / USUAL_ENERGY
 
     @property
     def record(self) -> list[dict[str, Any]]:
@@ -396,14 +403,6 @@ class Workbench:
 
     def _background(self, basis: TemporalBasis) -> Array | None:
         return None if self.background is None else resized(self.background, basis)
-
-    def _voxel_energy(self) -> float:
-        """Energy of the normalised lines' response to a voxel in the middle of the picture."""
-        still = TemporalBasis(self.frames, 1, self.problem.arrays)
-        point = np.zeros((1, self._side, self._side))
-        point[0, self._side // 2, self._side // 2] = 1
-        lines = host(self._operator(still, None).forward(self.problem.arrays.asarray(point)))
-        return float(np.square(lines / self.problem.norm, dtype=np.float64).sum()) or USUAL_ENERGY
 
     def _operator(self, basis: TemporalBasis, brightness: NDArray[Any] | None) -> Operator:
         key, segment = (basis.count, brightness is not None), self._segment
