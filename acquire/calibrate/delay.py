@@ -174,6 +174,7 @@ def _contributions(
             "the light's code does not distinguish its sub-steps", possible="a pseudo-random code"
         ) from error
     found = cho_solve(factor, right)
+    # the residual without another pass over the lines; rounding may leave it below 0
     variance = max(float(y @ y - right @ found), 0.0) / (len(y) - unknown)
     errors = np.sqrt(variance * np.diag(cho_solve(factor, np.eye(unknown))))
     return found[:-1], errors

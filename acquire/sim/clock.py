@@ -260,6 +260,7 @@ class Wire:
                 return reading
             wake_ns, nap_s = deadline_ns, _POLL_S
             if reading.train is not None and reading.running and reading.run == run:
+                # pulses count from 0: this is the last that is waited for
                 wake_ns, nap_s = min(wake_ns, reading.train.due_ns(pulses - 1)), _STOP_POLL_S
             self.clock.sleep(min(nap_s, max(wake_ns - now_ns, 1) * 1e-9))
 

@@ -57,6 +57,7 @@ class SideBySide:
     def next_block(self, timeout_s: float) -> CameraBlock | None:
         """Return the next lines that every part has delivered."""
         while (blocks := self._blocks(timeout_s)) is not None:
+            # a part that lost lines has blocks that begin and end elsewhere
             first = max(block.first_line for block in blocks)
             end = min(block.first_line + len(block.flags) for block in blocks)
             self._waiting = [_from(block, end) for block in blocks]

@@ -326,6 +326,7 @@ class _Container:
     def frame(self, index: int) -> Light:
         import av
 
+        # the frame that was decoded last is still there; an earlier one needs a new start
         if index < self._next - 1 or self._latest is None:
             self._next, self._decoded = 0, self._decode()
         while self._next <= index:

@@ -35,6 +35,7 @@ if TYPE_CHECKING:
 ROOM = 1 << 23
 """Number of sub-steps whose light is kept: more than a minute."""
 _HEADER_BYTES = 4096
+# indices of 64-bit words; two are pulses, one for each arm
 _SEQUENCE, _RUN, _RUNNING, _PULSES, _SUBSTEPS, _PERIOD_CLOCKS, _CLOCK_HZ, _FIELDS = 0, 1, 2, 3, 5, 6, 7, 8
 _POLL_S = 0.001
 _LIGHT_S = 10.0

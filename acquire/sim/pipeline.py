@@ -301,6 +301,7 @@ def _sensor(
         arm=name,
         seed=bench.scene.seed,
         realisation=bench.realisation,
+        # an emulated camera has M·S stages, and moves its charge once per line
         stages=geometry.stages * merge,
         substeps=geometry.substeps // merge,
         pixels=pixels,

@@ -90,6 +90,7 @@ class Stage:
     def texture(self, *scales: float) -> Image:
         """Return smooth noise of several scales (fractions of the picture), from 0 to 1."""
         total = sum(
+            # the wider noise is smoothed, the weaker it is: the factor makes all scales alike
             gaussian_filter(self.rng.standard_normal((self.n, self.n)), scale * self.n, mode="wrap") * scale
             for scale in scales
         )

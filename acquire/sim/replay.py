@@ -49,6 +49,7 @@ def replay_code(recording: Recording) -> Code:
     """Return the code of a run whose line 0 is the recording's first line."""
     code = code_from_attrs(recording.attrs["code"])
     index = recording.geometry_for(1).substeps * recording.first_line
+    # a register that starts in the state of that index makes the same bits from there on
     if isinstance(code, PrbsCode):
         return PrbsCode(code.degree, state_at(code.degree, code.state, index))
     if isinstance(code, ConstantCode):

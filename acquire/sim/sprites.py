@@ -105,6 +105,7 @@ class _Sprite:
     def _places(self, substeps: NDArray[np.int64]) -> Grid:
         """Return row and column in pixels, cosine and sine of the heading: (frame, 4)."""
         config = self._config
+        # in turns, counter-clockwise; rows count downwards, hence the sign of the sine below
         orbit = self._turns(substeps, config.orbit_hz, config.orbit_phase_deg)
         if config.turn_hz is None:
             # On a circle, the direction of motion is a quarter of a turn from that of the position.

@@ -93,6 +93,7 @@ class GigeCamera:
         self._control = [_bound(address, shared=False), _bound("255.255.255.255", shared=True)]
         self._lines = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._lines.bind((address, 0))
+        # sender, request and answer of the last command
         self._answered: tuple[Any, protocol.Request | None, bytes | None] = (None, None, None)
         self._acquiring = False
         self._frames = 0

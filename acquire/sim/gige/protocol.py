@@ -91,6 +91,7 @@ class Registers:
         self.memory = bytearray(BOOTSTRAP_BYTES) + bytearray(space)
         for at, text in texts.items():
             self.memory[at : at + len(text)] = text.encode()
+        # in network byte order, like the standard's numbers
         self.memory[ADDRESS : ADDRESS + 4] = address
         # Version 1.0 of the standard, big-endian, one stream; time stamps of 10⁹ ticks per second are in ns.
         numbers = {0: 0x1_0000, DEVICE_MODE: 0x8000_0000, STREAM_CHANNELS: 1, HEARTBEAT_MS: 3000}
