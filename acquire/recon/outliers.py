@@ -5,7 +5,7 @@ are tolerant: a sample is an outlier only if no scene explains it.
 
     not finite    NaN or infinite
     spike         far from the median of its column's neighbouring lines, which share nearly all their light
-    hot column    its median is many times that of nearly all columns
+    hot column    its median is many times that of nearly all columns, and not that of a small lamp's light
     stuck column  the same value in every line, while columns vary
 """
 
@@ -24,6 +24,9 @@ SPIKE_DEVIATIONS = 20.0
 SPIKE_LEVEL = 0.5
 """Smallest height of a spike, relative to the samples' 99th percentile, so that quiet scenes have none."""
 HOT_RATIO = 10.0
+STEADY = 0.5 / 3**0.5
+"""Relative standard deviation of a hot column's lines at most, times √M: light under a random code varies by
+1/√(S·M) if it fills all rows, as a slit, and more if it fills fewer; defects need not vary at all."""
 FEWEST_VARYING = 0.1
 """Share of an arm's columns that must vary for a constant one to be suspicious."""
 FEWEST_TOGETHER = 3
@@ -59,7 +62,17 @@ def _hot(samples: NDArray[np.float64], left: NDArray[np.bool_]) -> NDArray[np.bo
     medians = np.median(np.abs(samples), axis=1, keepdims=True)
     # of nearly all columns, not of the middle one: most of a scene may be dark
     usual = np.quantile(medians, 0.9, axis=2, keepdims=True)
-    return np.asarray(np.broadcast_to((medians > HOT_RATIO * usual) & (usual > 0), samples.shape))
+    bright = (medians > HOT_RATIO * usual) & (usual > 0)
+    if not bright.any():
+        return np.zeros_like(left)
+
+    # A lamp or a slit on dark ground is in few columns, too. It follows the code, and both arms see all of
+    # its light: their totals agree better with it than without it. By medians, which spikes do not change.
+    follows = bright & (samples.std(axis=1, keepdims=True) > STEADY / samples.shape[2] ** 0.5 * medians)
+    total, without = medians.sum(axis=2, keepdims=True), (medians * ~follows).sum(axis=2, keepdims=True)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        seen_by_both = np.abs(np.log(total / total[::-1])) < np.abs(np.log(without / total[::-1]))
+    return np.asarray(np.broadcast_to(bright & ~(follows & seen_by_both), samples.shape))
 
 
 def _stuck(samples: NDArray[np.float64], left: NDArray[np.bool_]) -> NDArray[np.bool_]:
