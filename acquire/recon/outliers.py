@@ -5,6 +5,7 @@ are tolerant: a sample is an outlier only if no scene explains it.
 
     not finite    NaN or infinite
     spike         far from the median of its column's neighbouring lines, which share nearly all their light
+                  unless it is that of a few rows, and far from what the column has in most lines
     hot column    its median is many times that of nearly all columns, and not that of a small lamp's light
     stuck column  the same value in every line, while columns vary
 """
@@ -23,6 +24,8 @@ SPIKE_LINES = 5
 SPIKE_DEVIATIONS = 20.0
 SPIKE_LEVEL = 0.5
 """Smallest height of a spike, relative to the samples' 99th percentile, so that quiet scenes have none."""
+FENCE = 1.5
+"""Distance of a spike from the middle half of its column's samples, in their range (Tukey's inner fences)."""
 HOT_RATIO = 10.0
 STEADY = 0.5 / 3**0.5
 """Relative standard deviation of a hot column's lines at most, times √M: light under a random code varies by
@@ -53,7 +56,16 @@ def _spikes(samples: NDArray[np.float64], left: NDArray[np.bool_]) -> NDArray[np
     # standard deviation of normal noise with this median
     spread = 1.4826 * np.median(deviation[left])
     level = np.quantile(np.abs(samples[left]), 0.99)
-    return np.asarray(deviation > SPIKE_DEVIATIONS * spread + SPIKE_LEVEL * level)
+    far = SPIKE_DEVIATIONS * spread + SPIKE_LEVEL * level
+    found = np.asarray(left & (deviation > far))
+
+    # Of a lamp of a few rows, neighbouring lines share hardly any light: they differ by as much as all do.
+    for arm, column in np.argwhere(found.any(axis=1)):
+        values = samples[arm, :, column]
+        low, high = np.quantile(values[left[arm, :, column]], (0.25, 0.75))
+        fence = FENCE * (high - low) + far
+        found[arm, :, column] &= np.maximum(values - high, low - values) > fence
+    return found
 
 
 def _hot(samples: NDArray[np.float64], left: NDArray[np.bool_]) -> NDArray[np.bool_]:

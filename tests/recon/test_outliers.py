@@ -61,3 +61,21 @@ def test_hot_columns_are_found_in_both_arms_and_beside_a_lamp() -> None:
     lamp = lines_of(WHERE < 0.03, 1e4)
     make_hot(lamp, 0, 5)
     assert hot_columns(lamp) == [[5], []]
+
+
+@pytest.mark.parametrize("radius", [0.004, 0.008, 0.015])
+def test_a_lamp_of_a_few_rows_has_no_spikes(radius: float) -> None:
+    """Neighbouring lines share hardly any of its light: up to two fifths of what it lit were masked."""
+    for brightest_e in (1e4, 1e6):
+        lines = lines_of(radius > WHERE, brightest_e)
+        assert outliers(lines, np.ones(lines.shape, np.bool_)) == {}
+
+
+def test_spikes_are_found_in_many_lines_of_a_column_and_on_a_lamp() -> None:
+    lines = lines_of(WHERE < 0.3, 1e4)
+    wild = np.zeros(lines.shape, np.bool_)
+    wild[0, 3::10, 20] = True  # a tenth of a column's lines
+    wild[1, 50, 30] = wild[1, 120, 2] = True
+    found = outliers(np.where(wild, 3e4, lines), np.ones(lines.shape, np.bool_))
+    assert list(found) == ["spike"]
+    assert (found["spike"] == wild).all()
