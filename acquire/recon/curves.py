@@ -134,7 +134,7 @@ class CurveFit:
         """
         cosines, rank = start.shape
         samples = np.count_nonzero(self._problem.weight)
-        # as if the masked samples were spread evenly, which is near enough for a preconditioner
+        # as if the masked samples were spread evenly, which is near enough for a preconditioner and a prior
         gram *= samples / self._problem.weight.size / self._problem.norm**2
         self._damping = max(self._ridge * float(np.trace(gram)) / len(gram), float(np.finfo(np.float32).tiny))
         # in the order of `gram`: all cosines of a pattern, then those of the next

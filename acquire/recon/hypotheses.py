@@ -177,6 +177,7 @@ class LineModel:
                 _displaced(a, self._size, self._alignment.to_a),
                 _displaced(b, self._size, self._alignment.to_b),
             )
+        # what arm B saw predicts arm A, and the other way round
         scenes = (b, turn.to_b(a))
         gain = [view.gain(arm, each) for arm, (view, each) in enumerate(zip(views, scenes, strict=True))]
         return Evidence(np.concatenate(own), np.concatenate(gain))

@@ -102,6 +102,7 @@ def _stuck(samples: NDArray[np.float64], left: NDArray[np.bool_]) -> NDArray[np.
     dark = still & (np.abs(high - darkness) <= 1e-3 * brightest)
     # a single dark column between lit ones is stuck: dark parts of a scene are mostly wider
     lit = np.median(np.abs(samples), axis=1, keepdims=True) > 0.1 * brightest
+    # an outermost column has one neighbour: itself stands for the other
     padded = np.pad(lit, ((0, 0), (0, 0), (1, 1)), mode="edge")
     lonely = dark & padded[:, :, :-2] & padded[:, :, 2:]
     return np.asarray(np.broadcast_to(still & usual & (~dark | lonely), samples.shape))

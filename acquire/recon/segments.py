@@ -137,6 +137,7 @@ class Stream:
             frames = -(-(end - S * first_line) // T_m)
             # what the first row shows in sub-step t is in line t // S, so that lines go up to the frames' end
             end_line = first_line - (-frames * T_m // S)
+        # a stretch shorter than its lines' exposure has at least one of them
         lines = max(1, min(self.end_line, end_line) - first_line)
         return SubSegment(stretch.begin, stretch.end, stretch.voxels, first_line, lines, fade_in, fade_out)
 

@@ -37,6 +37,7 @@ def laid_out(scene: Scene, fibre: Fibre, arm: str) -> Scene:
 
     if isinstance(scene, SeparableScene):
         return _MappedMasks(scene, image)
+    # frames of a fibre are wider than they are high; ``size`` is their height
     return _MappedFrames(scene, image, fibre.size)
 
 

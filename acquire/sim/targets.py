@@ -89,6 +89,7 @@ def usaf_bars(groups: tuple[int, ...]) -> list[Bar]:
             bars += _element(group, element, row, left)
             row += 7.3 * bar_width_mm(group, element)
         bars += _element(group, 1, bottom, -1.0 * unit)
+        # the square of the standard's layout, which is no element
         bars.append(Bar(group, 0, bottom, -10.5 * unit, 5 * unit, 5 * unit))
         row = top
         for element in range(1, 7) if group + 1 in groups else ():

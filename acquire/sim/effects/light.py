@@ -165,6 +165,7 @@ class Delays(Effect):
         late = (self.light_s - camera_s - setting.settled_s) / setting.substep_s
         begin, end = (late + edge for edge in setting.lit_part)
         whole = floor(begin)
+        # of the light of a sub-step, what falls into the sub-step after the one in which it begins
         part = max(0.0, end - whole - 1) / (end - begin)
 
         def delayed(light: Illumination) -> Callable[[int, int], NDArray[Any]]:
