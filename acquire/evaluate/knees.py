@@ -137,5 +137,6 @@ def plain(seconds: float) -> str:
     """Format a time with two digits and without an exponent: 0.85, 15, 120."""
     if seconds <= 0:
         return "0"
-    digits = 1 - math.floor(math.log10(seconds))
-    return f"{round(seconds, digits):.{max(0, digits)}f}"
+    # rounded first: 9.96 has its two digits as 10
+    rounded = float(f"{seconds:.1e}")
+    return f"{rounded:.{max(0, 1 - math.floor(math.log10(rounded)))}f}"
