@@ -128,7 +128,8 @@ class Stream:
         S, T_m = self.substeps, stretch.voxels.temporal_merge
         begin, end = stretch.begin - fade_in, stretch.end + fade_out
         if self.is_slow(stretch.voxels):
-            first_line = max(self.first_line, begin // S)
+            # of the sub-steps after the last line has begun, it is the only one that sees any
+            first_line = min(max(self.first_line, begin // S), self.end_line - 1)
             # the sub-steps of a line: the last line has to end within the stretch
             exposed = self.geometry(1).span
             end_line = -(-(end - exposed) // S) + 1
