@@ -264,6 +264,7 @@ class Calibration:
             self.alignment if step == "align" else None,
             facts,
             tuple(facts.get("warnings", ())),
+            self.tiles if step == "align" else (),
         )
 
     def to_attrs(self) -> dict[str, Any]:

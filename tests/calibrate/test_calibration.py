@@ -14,7 +14,7 @@ from instruments import NOISE, dots, record, white
 
 from acquire.calibrate import Calibration, Measured, calibrated, open_calibration, save_calibration
 from acquire.calibrate.apply import check_fits
-from acquire.calibrate.calibration import Finding
+from acquire.calibrate.calibration import Finding, TileAlignment
 from acquire.calibrate.check import check
 from acquire.calibrate.columns import dark
 from acquire.calibrate.exposure import open_exposure
@@ -77,6 +77,17 @@ def test_a_repeated_step_replaces_the_first(
     assert found.steps["dark"]["lines"] == 64
     assert found.steps["flat"] == whole.steps["flat"]
     assert [path.name for path in tmp_path.iterdir()] == ["cal.zarr"]
+
+
+def test_a_steps_result_holds_the_tiles_that_it_aligned(whole: Calibration) -> None:
+    assert whole.alignment is not None
+    tiles = (TileAlignment("left", (0, 4), whole.alignment),)
+    facts = {"lines": 64, "tiles": 1, "misfit": 0.01}
+    known = replace(whole, alignment=None).with_step(
+        Finding("align", whole.instrument, facts=facts, tiles=tiles)
+    )
+    assert known.finding("align").tiles == tiles
+    assert known.finding("orientation").tiles == ()
 
 
 def test_anything_but_a_calibration_is_neither_read_nor_replaced(
