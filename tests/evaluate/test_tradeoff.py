@@ -139,6 +139,7 @@ def test_a_study_of_lost_lines_alone_has_no_plot(run, tmp_path):
     document = json.loads((tmp_path / "tradeoff.json").read_text())
     assert [each["effect"] for each in document["study"]["effects"]] == ["dropped_lines"]
     assert not list(tmp_path.glob("effects*"))
+    assert "The simulator's effects" not in (tmp_path / "index.html").read_text(encoding="utf-8")
 
 
 def test_page_and_table_agree(judge, run, tmp_path):
