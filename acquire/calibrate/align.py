@@ -59,7 +59,7 @@ def align(a: Still, b: Still, geometry: Geometry, start: tuple[float, float] = (
     numbers = np.array([*start, 0.0, 0.0, 1.0, 0.0])
     for sigma in SMOOTHINGS:
         comparison = _Comparison(images, sigma)
-        # Outliers are told by the spread of the differences, which in clean images exceeds the noise by far.
+        # Outliers are identified by the spread of the differences, far above the noise in clean images.
         for loss in ("linear", "soft_l1"):
             # 0.6745 σ is the median of the absolute values of normal noise
             spread = float(np.median(np.abs(comparison(numbers)))) / 0.6745

@@ -101,6 +101,7 @@ def calibrated(segment: Segment, calibration: Calibration) -> Segment:
     }
     changes: dict[str, Any] = {name: value for name, value in known.items() if value is not None}
     if balance is not None:
+        # a reconstruction does not estimate the balance once more
         changes["balanced"] = True
     if calibration.usable is not None and not calibration.usable.all():
         changes["mask"] = segment.mask & calibration.usable[:, None, :]
@@ -136,6 +137,7 @@ def _of_columns(calibration: Calibration, segment: Segment) -> Calibration:
 
     return replace(
         calibration,
+        # as if the sensor had only the columns that see the tile
         instrument=calibration.instrument.model_copy(update={"pixels": None}),
         quantities={
             name: Measured(cut(each.value), cut(each.uncertainty))
@@ -144,6 +146,7 @@ def _of_columns(calibration: Calibration, segment: Segment) -> Calibration:
             for name, each in calibration.quantities.items()
         },
         usable=None if calibration.usable is None else cut(calibration.usable),
+        # a segment does not name its tile, but its first columns do
         alignment=next((e.found for e in calibration.tiles if e.columns == segment.first_column), None),
     )
 

@@ -58,21 +58,21 @@ QUANTITIES = {
     "offset_dn": Quantity(COLUMN, "DN", "of a pixel under a dark code"),
     "noise_dn": Quantity(COLUMN, "DN", "temporal standard deviation of a dark pixel"),
     "ambient_dn": Quantity(COLUMN, "DN", "added by light that no code switches"),
-    "gain": Quantity(COLUMN, "1", "response beside the mean of the arm's columns"),
-    "balance": Quantity(ARM, "1", "response of the arm beside the mean of both"),
+    "gain": Quantity(COLUMN, "1", "response relative to the mean of the arm's columns"),
+    "balance": Quantity(ARM, "1", "response of the arm relative to the mean of both"),
     "dn_per_electron": Quantity(ARM, "DN", "system gain K of EMVA 1288"),
     "read_noise_e": Quantity(ARM, "electron", "temporal dark noise of EMVA 1288"),
     "full_well_e": Quantity(ARM, "electron", "saturation capacity of EMVA 1288"),
     "light_late_ticks": Quantity(
         ARM,
         "1",
-        "by which light comes after the charge's moves without lead and delays, in the trigger's ticks",
+        "delay of the light after the charge transfer, without lead and delays, in the trigger's ticks",
     ),
     "blur_px": Quantity(
         WIDTHS, "1", "standard deviation of the optics' blur along the transfer and across it, in fine pixels"
     ),
     "linearity_error": Quantity(ARM, "1", "linearity error of EMVA 1288"),
-    "excess_dn": Quantity(CURVE, "DN", "by which samples are too high that read 0 … white, evenly"),
+    "excess_dn": Quantity(CURVE, "DN", "excess of samples that read 0 … white, at evenly spaced knots"),
 }
 
 FOUND_BY = {
@@ -237,6 +237,7 @@ class Calibration:
             quantities={**self.quantities, **found.quantities},
             # from all steps anew: a step that is repeated can make columns usable again
             usable=_usable(steps, self.instrument.columns),
+            # one that was not clear is None, and replaces nothing
             orientation=found.orientation or self.orientation,
             alignment=found.alignment or self.alignment,
             steps=steps,
@@ -263,6 +264,7 @@ class Calibration:
             self.alignment if step == "align" else None,
             facts,
             tuple(facts.get("warnings", ())),
+            self.tiles if step == "align" else (),
         )
 
     def to_attrs(self) -> dict[str, Any]:
@@ -310,11 +312,12 @@ class Calibration:
                 usable=None if usable is None else np.asarray(usable, np.bool_),
                 orientation=attrs["orientation"],
                 alignment=None if found is None else _alignment(found),
-                steps={name: dict(step) for name, step in attrs["steps"].items()},
+                steps={name: _step(step) for name, step in attrs["steps"].items()},
                 tiles=tuple(
                     TileAlignment(
                         str(e["tile"]), (int(e["seen_from"][0]), int(e["seen_from"][1])), _alignment(e)
                     )
+                    # calibrations from before tiles were aligned have none
                     for e in attrs.get("tiles", ())
                 ),
             )
@@ -337,6 +340,13 @@ def _usable(steps: Mapping[str, dict[str, Any]], columns: int) -> NDArray[np.boo
         for row, arm in zip(usable, ARMS, strict=True):
             row[each.get(arm, [])] = False
     return usable
+
+
+def _step(attrs: Mapping[str, Any]) -> dict[str, Any]:
+    # a moment without a zone cannot be compared with a recording's
+    if "made" in attrs and datetime.fromisoformat(attrs["made"]).tzinfo is None:
+        raise ValueError(f"a step was made at {attrs['made']}, in no time zone")
+    return dict(attrs)
 
 
 def _alignment(attrs: Mapping[str, Any]) -> AlignmentFound:

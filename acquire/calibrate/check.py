@@ -97,7 +97,7 @@ def check(exposure: Exposure, known: Calibration, *, covered: bool = False) -> C
         except UsageError as error:  # many targets have no edges that show the blur
             doubts += (f"the optics' blur was not compared: {error.message}",)
     found = orientation(exposure, known)
-    expected = known.orientation or "turn 90"
+    expected = known.orientation or "turn 90"  # `MODEL`, if none was measured
     if found.orientation is None or found.orientation != expected:
         result = "is not clear" if found.orientation is None else f"is {found.orientation!r}"
         doubt = f"the orientation {result}; the calibration has {expected!r}"
@@ -114,8 +114,10 @@ def _columns(found: Finding, known: Calibration, name: str, unit: str) -> Iterat
         good &= known.usable
     change: NDArray[np.float64] = np.where(good, now.value - before.value, 0.0)
     sure = np.hypot(now.uncertainty, before.uncertainty)
-    # the most significant change, which need not be the largest
-    at = np.unravel_index((np.abs(change) - SURE * sure).argmax(), change.shape)
+    # the change that exceeds its own limit (`Compared.holds`) by most; it need not be the largest, and a
+    # small one beyond doubt must not hide it
+    limit = np.maximum(MATTERS[name], SURE * sure)
+    at = np.unravel_index((np.abs(change) - limit).argmax(), change.shape)
     yield Compared(name, unit, float(change[at]), float(sure[at]), MATTERS[name])
 
 
@@ -131,8 +133,10 @@ def _balance(found: Finding, known: Calibration) -> Iterator[Compared]:
 def _alignment(found: Finding, known: Calibration) -> Iterator[Compared]:
     assert found.alignment is not None  # `alignment` returns one or raises
     before, now = known.alignment, found.alignment
+    # without an alignment, a reconstruction takes the arms to coincide
     then = before.alignment.facts() if before else {"magnification": 1.0}
     errors = before.uncertainty if before else {}
+    # a magnification is compared by what it displaces at the field's edge
     half = known.instrument.stages * known.instrument.substeps / 2
     scales = {"rows": (1.0, "pixels"), "columns": (1.0, "pixels"), "turn_deg": (1.0, "turn_deg")}
     for name, (scale, kind) in (scales | {"magnification": (half, "pixels")}).items():

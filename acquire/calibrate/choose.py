@@ -99,6 +99,7 @@ def carried_calibration(config: RigConfig, layout: str) -> Carried:
     try:
         known = open_calibration(place)
     except AcquireError as error:
+        # a link to nowhere, or something else under this name, is a mistake and not a calibration to come
         if isinstance(error, PlaceError) and not os.path.lexists(place):
             text = f"none: {place} is not there; acquire calibrate all --out {place} makes it"
             return Carried({"calibration_missing": str(place)}, place, text)
@@ -124,6 +125,7 @@ def configured(config: RigConfig, layout: str) -> Instrument:
         layout=layout,
         cameras={
             arm: {
+                # what a recording states, too (`instrument_of`): only what both state is compared
                 "serial": camera.serial,
                 "PixelFormat": camera.pixel_format,
                 "white_dn": camera.white_dn,

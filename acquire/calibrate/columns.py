@@ -126,6 +126,7 @@ def flat(
     error = np.hypot(
         np.sqrt(found.variance / found.lines[:, None]), known.quantities["offset_dn"].uncertainty
     )
+    # flicker of the light is common to all columns: it makes the arms' levels uncertain, not the gains
     own_error = np.sqrt(np.maximum(found.own_variance, QUANTISATION_DN2) / found.lines[:, None])
     relative = np.hypot(own_error, known.quantities["offset_dn"].uncertainty)
     relative = relative / np.where(alive, light, np.inf)  # a column without light has no gain
@@ -135,6 +136,7 @@ def flat(
     arm_error = np.sqrt((error**2).sum(axis=1)) / light.sum(axis=1)
     balance = arms / arms.mean()
     quantities = {
+        # a gain of 1 that is assumed: a blurred edge of the field takes 5 % of a column's light
         "gain": Measured(gain, np.where(trusted, relative, 0.05)),
         # a/((a + b)/2) changes by half of the relative change of either arm
         "balance": Measured(balance, balance * np.hypot(*arm_error) / 2),

@@ -25,6 +25,7 @@ def knots_dn(instrument: Instrument) -> NDArray[np.float64]:
 def curve_of(known: Calibration) -> ConverterCurve | None:
     """Return the curve, or None if it was not measured or both cameras are linear."""
     excess = known.value("excess_dn")
+    # linear cameras have an excess of 0, and no curve, whose application would take time
     if excess is None or not excess.any():
         return None
     return ConverterCurve(knots_dn(known.instrument), excess)

@@ -96,6 +96,7 @@ def beyond(exposure: Exposure) -> tuple[Beyond, Beyond]:
     parts = []
     for segment in exposure.blocks():
         sums = segment.lines.sum(axis=2, dtype=np.float64)
+        # a line that lacks columns has less light for another reason than its delay
         parts.append(np.where(segment.mask.all(axis=2), sums, np.nan))
     geometry = exposure.recording.geometry_for(1)
     found = []
@@ -173,6 +174,7 @@ def _contributions(
             "the light's code does not distinguish its sub-steps", possible="a pseudo-random code"
         ) from error
     found = cho_solve(factor, right)
+    # the residual without another pass over the lines; rounding may leave it below 0
     variance = max(float(y @ y - right @ found), 0.0) / (len(y) - unknown)
     errors = np.sqrt(variance * np.diag(cho_solve(factor, np.eye(unknown))))
     return found[:-1], errors

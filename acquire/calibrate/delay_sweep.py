@@ -63,6 +63,7 @@ class Setting:
         ``later`` is in ticks, from the light of a line's first sub-step.
         """
         a, b = (max(0, round(each)) for each in later)
+        # the lead moves the light, for both arms alike; what is left of either is its own delay
         lead = min(a, b, self.most_lead)
         return Delays(lead, min(a - lead, self.most_delay), min(b - lead, self.most_delay))
 
@@ -186,6 +187,7 @@ def evaluate_sweep(points: Sequence[Point], exposures: Sequence[Exposure], setti
 def settings_for(late: NDArray[np.float64], setting: Setting) -> dict[str, int]:
     """Return the keys of ``[trigger]`` that align light and charge of both arms as far as possible."""
     late = late - setting.whole_substeps(late) * setting.substep_ticks
+    # light that is early without any delay cannot be delayed; its beginning is cut off (`light.open_ticks`)
     earlier = max(0.0, -float(late.min()))
     delays = setting.delays((late + earlier).tolist())
     keys = {
@@ -198,6 +200,7 @@ def settings_for(late: NDArray[np.float64], setting: Setting) -> dict[str, int]:
 
 def _crossing(points: Sequence[Point], arm: int, substep_ticks: int) -> Crossing:
     """Fit one arm's delay, with which the table in `acquire.calibrate.delay` explains all recordings."""
+    # a start only, and for the side of every recording: the edge rows may be darker than the mean row
     sight = float(np.median([first_sight(point, substep_ticks)[arm] for point in points]))
     later = np.array([point.later[arm] + point.seen[arm].whole * substep_ticks for point in points])
     kept = np.abs(sight - later) > LEAST_SHARE * substep_ticks
@@ -238,12 +241,14 @@ class _Model:
 
         Rounded edges of the light make late light seem later, and early light earlier.
         """
+        # rows as bright as the mean row
         start = [self._sight / self._ticks, 1.0, 1.0, 1.0, 1.0, *([0.0] if rounded else [])]
         found = least_squares(self._residual, start, x_scale=0.1)
         spare = found.fun.size - len(start)
         # A scatter larger than the errors makes them larger; a smaller one is chance, and changes nothing.
         scale = max(1.0, 2 * found.cost / spare) if spare > 0 else 1.0
         slopes = np.asarray(found.jac, np.float64)
+        # pinv: if all recordings are on one side, light on some of the four rows never counts
         covariance = np.linalg.pinv(slopes.T @ slopes) * scale
         errors = np.sqrt(np.diag(covariance)) * self._ticks
         late = float(found.x[0]) * self._ticks, float(errors[0])

@@ -79,6 +79,7 @@ class Exposure:
 
     def samples(self) -> Iterator[tuple[NDArray[Any], NDArray[np.bool_]]]:
         """Yield the samples (arm, line, column) of all columns, lit or not, and which are usable."""
+        # behind a fibre a cut segment has one tile's columns; the steps measure all
         if self.recording.fibre is None:
             yield from ((block.lines, block.mask) for block in self.blocks())
             return
@@ -177,6 +178,7 @@ def no_progress(done: int, total: int) -> None:
 
 def moments(exposure: Exposure, progress: Progress = no_progress) -> Moments:
     """Compute the statistics of an exposure. Raises UsageError if an arm has no usable line."""
+    # samples are whole numbers
     white = np.ceil(exposure.camera("white_dn"))[:, None, None]
     parts: list[tuple[NDArray[Any], ...]] = []
     done = 0
@@ -198,12 +200,14 @@ def moments(exposure: Exposure, progress: Progress = no_progress) -> Moments:
     # Every block has a mean of its own, so drift does not count as noise; that costs it a degree of freedom.
     mean, variance = pooled(means, counts), pooled(variances, (counts - 1).clip(0))
     errors = np.sqrt(variance / counts.clip(1)[:, :, None]).clip(1e-9)
+    # a block of which no line arrived has no mean that could differ
+    apart = np.where(counts[:, :, None] > 0, np.abs(means - mean) / errors, 0.0)
     return Moments(
         lines=total,
         mean=mean,
         variance=variance,
         own_variance=pooled(own, (counts - 1).clip(0)),
-        drift=np.abs((means - mean) / errors).max(axis=0) if len(parts) > 1 else np.zeros_like(mean),
+        drift=apart.max(axis=0) if len(parts) > 1 else np.zeros_like(mean),
         at_zero=pooled(zeros, counts),
         saturated=pooled(saturated, counts),
     )
@@ -221,12 +225,14 @@ def _block_moments(
     mean, variance, own, zeros, saturated = found
     for arm, here in enumerate(arrived):
         samples = lines[arm, here]
-        if len(samples) < 2:
+        if not len(samples):
             continue
         mean[arm] = samples.mean(axis=0)
-        variance[arm] = samples.var(axis=0, ddof=1)
-        own[arm] = _own_variance(samples, mean[arm])
         zeros[arm], saturated[arm] = (samples == 0).mean(axis=0), (samples >= white[arm]).mean(axis=0)
+        # a single line has no variance, and no weight in that of all
+        if len(samples) > 1:
+            variance[arm] = samples.var(axis=0, ddof=1)
+            own[arm] = _own_variance(samples, mean[arm])
     return counts, *found
 
 

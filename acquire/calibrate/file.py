@@ -49,6 +49,7 @@ def save_calibration(place: Path | str, calibration: Calibration) -> None:
     # only a calibration is replaced: anything else raises here
     open_calibration(path)
     fresh = path.with_name(f".{path.name}.{os.getpid()}.new.zarr")
+    # a killed process may have left it
     shutil.rmtree(fresh, ignore_errors=True)
     _deliver(delivery_to(fresh), fresh, calibration)
     before = path.with_name(f".{path.name}.{os.getpid()}.before")
@@ -121,5 +122,6 @@ def _write(directory: Path, calibration: Calibration) -> None:
             names.append(key)
     if not names and not calibration.steps:
         raise UsageError("a calibration without a step cannot be written", possible="one step at least")
+    # the arrays' documents inside the group's (consolidated metadata): readers at a URL need only this one
     nodes = {name: json.loads((directory / name / ROOT).read_bytes()) for name in names}
     (directory / ROOT).write_bytes(to_json(group_document(calibration.facts(), nodes)))

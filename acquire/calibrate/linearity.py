@@ -100,7 +100,9 @@ class Bend:
         data sheets of converters. Below and above them, the curve continues straight.
         """
         x = light_dn / self.top_dn
+        # less a straight line, so that the excess is 0 at black and at the brightest level
         bent = _powers(x, len(self.powers)) - x[..., None]
+        # f of the brightest level is (1 + Σ c_k) times its reading; this makes the reading right
         scale = 1 / (1 + self.powers.sum())
         error = np.sqrt(np.einsum("...i,ij,...j->...", bent, self.covariance, bent))
         return -self.top_dn * scale * (bent @ self.powers), self.top_dn * abs(scale) * error
@@ -220,6 +222,7 @@ def _ramps(
             if kept and variance.mean() < FALLEN * kept[-1][3]:
                 full = float(kept[-1][1].mean())
                 break
+            # of the columns' own noise; for what the lamp does there is `STEADY`
             noise = float(np.sqrt((variance / found.lines[i]).sum()) / good.sum())
             if light.mean() > LOWEST_LIGHT_DN:
                 kept.append((ticks, light, noise, float(variance.mean())))
@@ -237,6 +240,7 @@ def _ramps(
 def _bend(ramp: Ramp) -> Bend:
     """Fit a ramp with as many powers as the F-test finds significant."""
     best, best_residual = _fitted(ramp, 0)
+    # not ended by the first that is not significant: several powers together may be
     for count in range(1, MOST_POWERS + 1):
         bend, residual = _fitted(ramp, count)
         more, free = count - len(best.powers), len(ramp.ticks) - 2 - count

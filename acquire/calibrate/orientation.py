@@ -63,6 +63,7 @@ class View:
         return turned[..., ::-1] if self.mirrored else turned
 
 
+# the model's own first: sorting by correlation leaves it in front of an equal one
 VIEWS = tuple(View(turn, mirrored) for mirrored in (False, True) for turn in (90, 270, 0, 180))
 MODEL = VIEWS[0]
 """Arm B's view in Eq. (4)."""
@@ -107,11 +108,12 @@ def correlations(a: NDArray[Any], b: NDArray[Any]) -> dict[View, tuple[float, tu
 
 
 def _whitened(image: NDArray[Any]) -> NDArray[np.float64]:
-    from scipy.ndimage import gaussian_filter
+    from scipy.ndimage import gaussian_filter  # scipy, which a capture host lacks
 
     rough: NDArray[np.float64] = image - gaussian_filter(image.astype(np.float64), 4.0, mode="nearest")
     # without the window's zeros at either end
     window = np.hanning(len(image) + 2)[1:-1]
+    # the root, because two images are multiplied
     flat: NDArray[np.float64] = (rough - rough.mean()) * np.sqrt(np.outer(window, window))
     return flat / max(float(np.linalg.norm(flat)), 1e-30)
 

@@ -189,7 +189,8 @@ def straight_edges(still: Still, substeps: int, arm: str) -> list[Edge]:
     ranked = sorted(places, key=lambda place: -steps[place])[:MOST_WINDOWS]
     noise = still.uncertainty
     if not ranked or steps[ranked[0]] <= CLEAR * noise:
-        best = steps[ranked[0]] / noise if ranked else 0.0
+        # without light, or in a simulation without effects, there may be no noise either
+        best = steps[ranked[0]] / noise if ranked and noise > 0 else 0.0
         raise _undetermined(
             arm, f"its best edge is {best:.1f} times the image's noise, and {CLEAR:g} times are needed"
         )

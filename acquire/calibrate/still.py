@@ -66,6 +66,7 @@ def _still(
     samples: NDArray[np.float64], mask: NDArray[np.bool_], windows: NDArray[Any], geometry: Geometry
 ) -> Still:
     share = mask.mean(axis=0)
+    # relative to the best column: lost lines are missing in all of them
     usable = share > 0.5 * share.max()
     # complete lines, so that one factorisation serves all columns
     lines = mask[:, usable].all(axis=1) if usable.any() else np.zeros(len(mask), np.bool_)

@@ -98,6 +98,7 @@ def alignment(exposure: Exposure, known: Calibration) -> Finding:
     shift = correlations(still_a.blocks(S), still_b.blocks(S))[MODEL][1]
     # the shift is in blocks of S fine pixels
     match = align(still_a, still_b, geometry, (S * shift[0], S * shift[1]))
+    # now that the alignment shows which columns of arm B look beyond the field
     quantities = without_field_edge(known, match.found.alignment)
     ends = bool(quantities)
     if not ends:
@@ -137,6 +138,7 @@ def tile_alignments(exposure: Exposure, known: Calibration) -> Finding:
     A tile in which the target does not determine it is left out and named in a warning. Raises UsageError if
     no tile remains.
     """
+    # no orientation: in a mirrored arm other columns would see the tile
     recording, bare = exposure.recording, replace(known, orientation=None, alignment=None, tiles=())
     assert recording.fibre is not None
     lines, found, warnings = min(exposure.lines, MOST_LINES), [], []
@@ -168,6 +170,7 @@ def _balance(known: Calibration, match: Match) -> dict[str, Measured]:
     if abs(match.brightness - 1) <= SAME_BALANCE:
         return {}
     before = known.value("balance")
+    # flats compare the light of the arms' whole fields, targets that of what both see
     before = np.ones(2) if before is None else before
     swapped = known.orientation is not None and view_named(known.orientation).swapped
     # if the arms are swapped, the model's arm B is camera A

@@ -56,6 +56,7 @@ def transfer(
     """
     dark_lines = int(known.steps.get("dark", {}).get("lines", 0))
     offset = offset_of(known, "transfer")
+    # a curve stretches noise by its slope
     dark_noise = straightened(known, offset, offset)[1] * known.quantities["noise_dn"].value
     usable = np.ones_like(offset, np.bool_) if known.usable is None else known.usable
     points: dict[str, list[Point]] = {arm: [] for arm in ARMS}
@@ -82,6 +83,7 @@ def transfer(
     read = np.sqrt(np.maximum((dark_noise**2).mean(axis=1) - QUANTISATION_DN2, 0)) / K
     read_error = read * np.hypot(error / K, 1 / np.sqrt(2.0 * dark_lines * offset.shape[1]))
     quantities = {"dn_per_electron": Measured(K, error), "read_noise_e": Measured(read, read_error)}
+    # of both arms or none: a quantity has a value for each
     if np.isfinite(full_dn).all():
         quantities["full_well_e"] = Measured(full_dn / K, full_dn / K * np.maximum(error / K, ROUGHLY))
     facts = {
@@ -114,6 +116,7 @@ def _slope(points: list[Point], arm: str) -> tuple[float, float, float]:
         )
     # the error of variance/light is error/light
     weights = np.array([(point.light / point.error) ** 2 for point in kept])
+    # lines through the origin, as the dark is subtracted from both
     slopes = np.array([point.variance / point.light for point in kept])
     K, error = float((weights * slopes).sum() / weights.sum()), float(weights.sum() ** -0.5)
     if FALLEN * error > K:

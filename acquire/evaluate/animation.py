@@ -40,6 +40,7 @@ def save_animation(
         write_webp(path, [draw_frame(result, frame) for frame in range(0, frames, step)])
         if path.stat().st_size <= max_bytes:
             return step
+        # how large a file becomes is known only once it is written
         step *= 2
     path.unlink(missing_ok=True)
     raise UsageError(

@@ -41,6 +41,7 @@ def recording_case(
     last = recording.first_line + recording.lines - lines
 
     def judge(repeat: int) -> Judge:
+        # where the recording ends, the last lines once more
         first = max(recording.first_line, min(first_line + apart * repeat, last))
         return Judge.of(recording, recording.cut(first, lines, tile), tile)
 
@@ -56,6 +57,7 @@ def procedural(name: str, full_well_e: float, lines: int) -> Case:
     camera = Camera(full_well_e, READ_NOISE_E if noisy else 0.0)
 
     def judge(repeat: int) -> Judge:
+        # a seed determines scene, code and noise
         recorded = record(name, repeat + 1, lines=lines, camera=camera)
         return Judge(recorded.segment, None, recorded.light)
 

@@ -186,6 +186,7 @@ def compare_curve(
 
 
 def _check_curve(values: NDArray[np.float64], interval_s: float, harmonics: int) -> None:
+    # the unknowns: an offset, the frequency, and two for each harmonic
     least = 2 * harmonics + 2
     if values.ndim != 1 or harmonics < 1 or len(values) < least:
         raise UsageError(
@@ -225,6 +226,7 @@ def _refine(
     interval_s = times_s[1]
     harmonics = _visible_harmonics(start_hz, interval_s, harmonics)
     lobe_hz = 1 / (len(values) * interval_s)
+    # not down to 0, where sine, cosine and offset become one
     low_hz = max(start_hz - lobe_hz, 0.25 * lobe_hz)
     high_hz = min(start_hz + lobe_hz, 0.5 / interval_s)
 

@@ -67,6 +67,7 @@ def line_streams(result: DemoResult) -> Figure:
     figure = canvas(4.6)
     axes = figure.subplots(1, 2, sharey=True, squeeze=False)[0]
     usable = segment.lines[segment.mask]
+    # of the samples in use: a single hot pixel would leave the others dark
     low, high = (float(usable.min()), float(usable.max())) if usable.size else (0.0, 1.0)
     half = np.diff(times).mean() / 2 if len(times) > 1 else 0.5
     # samples are centred on their pixel and their time
@@ -159,6 +160,7 @@ def representative_frames(result: DemoResult, count: int = FRAME_COLUMNS) -> NDA
     """Return indices (count,) spread over one period of the slowest region, or else over the whole video."""
     total = len(result.frame_ms)
     rates = [curve.theory.frequency_hz for curve in result.solvers[0].curves if not curve.constant]
+    # in frames
     period = round(1e6 / (min(rates) * result.frame_interval_us)) if rates else 0
     if not count <= period <= total:
         return np.linspace(0, total - 1, min(count, total)).round().astype(np.int64)

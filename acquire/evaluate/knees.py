@@ -64,6 +64,7 @@ def band(runs: Sequence[Run], name: str, clock: Clock = "seconds") -> Band | Non
             stairs.append(np.array(sorted(steps)))
     if not stairs:
         return None
+    # before that, the median would be one of fewer repeats
     begin = max(each[0, 0] for each in stairs)
     times_s = np.unique(np.concatenate([[begin], *(each[:, 0] for each in stairs)]))
     times_s = times_s[times_s >= begin]
@@ -84,6 +85,7 @@ def knees(curve: Band, *, ended: bool) -> list[Knee]:
     flat = -math.inf
     for seconds in map(float, curve.times_s):
         last = 2 * seconds > end
+        # for a run that was cut, the gain of doubling the time is unknown
         if last and not ended:
             break
         value = curve.at(seconds)
@@ -135,5 +137,6 @@ def plain(seconds: float) -> str:
     """Format a time with two digits and without an exponent: 0.85, 15, 120."""
     if seconds <= 0:
         return "0"
-    digits = 1 - math.floor(math.log10(seconds))
-    return f"{round(seconds, digits):.{max(0, digits)}f}"
+    # rounded first: 9.96 has its two digits as 10
+    rounded = float(f"{seconds:.1e}")
+    return f"{rounded:.{max(0, 1 - math.floor(math.log10(rounded)))}f}"

@@ -40,6 +40,7 @@ def psnr_per_frame(
 ) -> NDArray[np.float64]:
     """Return the PSNR of each frame (t,) in dB, all with the same peak; raises as :func:`psnr`."""
     video, truth = check_pair(video, truth)
+    # one peak for all frames: relative to its own, a dark frame would look bad
     pairs, peak = zip(video, truth, strict=True), checked_peak(truth, peak)
     return _decibel(np.array([_mean_squared_error(frame, true_frame, peak) for frame, true_frame in pairs]))
 

@@ -50,6 +50,7 @@ def clip_of(pictures: Sequence[Image.Image], max_bytes: int = MAX_BYTES) -> Clip
     """Encode the pictures as WebP; every second one is dropped until they fit into ``max_bytes``."""
     frames, step = [webp(picture, QUALITY) for picture in pictures], 1
     while len(frames) > 2 and sum(map(len, frames)) > max_bytes:
+        # by halves, so that the frames that are left stay equally far apart
         frames, step = frames[::2], 2 * step
     contrast = [np.asarray(picture.convert("L")).std() for picture in pictures[::step]]
     return Clip([webp_uri(each) for each in frames], step, int(np.argmax(contrast)))

@@ -154,7 +154,8 @@ def _picture(
 def grey(frame: NDArray[Any], peak: float, height_px: int) -> Image.Image:
     """Draw a frame (row, column) in 8 bits, from 0 (black) to ``peak`` (white), with square, sharp pixels."""
     rows, columns = frame.shape
-    values = np.clip(np.rint(frame * (255 / peak)), 0, 255).astype(np.uint8)
+    # NaN, as in tiles that were not reached, has no grey value
+    values = np.clip(np.rint(np.nan_to_num(frame) * (255 / peak)), 0, 255).astype(np.uint8)
     enlarge = height_px >= 3 * rows
     resample = Image.Resampling.NEAREST if enlarge else Image.Resampling.LANCZOS
     width = round(height_px * columns / rows)  # made even, as the codec of MP4 needs it
@@ -166,8 +167,9 @@ def _peak(panel: Panel) -> float:
     frames = panel.file.video.shape[0]
     some = np.unique(np.linspace(0, frames - 1, 12).astype(int))
     values = np.stack([np.asarray(panel.file.video[int(index)]) for index in some])
+    known = values[np.isfinite(values)]
     # a dark video has no peak to divide by
-    return float(np.quantile(values, PEAK_QUANTILE)) or 1.0
+    return float(np.quantile(known, PEAK_QUANTILE) if known.size else 0) or 1.0
 
 
 def _sheet(pictures: list[Image.Image]) -> Image.Image:

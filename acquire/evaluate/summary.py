@@ -146,4 +146,5 @@ def rounded(value: float | None, digits: int) -> float | None:
     """Round a value, without a negative zero; None for None and for values that are not finite."""
     if value is None or not math.isfinite(value):
         return None
+    # −0.0 + 0.0 is 0.0
     return round(float(value), digits) + 0.0

@@ -127,6 +127,7 @@ def _svg(figure: Figure) -> str:
     # Colours become variables, to which a rule in the drawing gives other values on dark screens.
     names = {colour: f"--ink{number}" for number, colour in enumerate(DARK)}
     for colour, name in names.items():
+        # after a colon or a space, as in a style; elsewhere it may be part of a text
         svg = re.sub(rf"(?<=[:\s]){colour}\b", f"var({name})", svg)
     light = "".join(f"{name}:{colour};" for colour, name in names.items())
     night = "".join(f"{names[colour]}:{other};" for colour, other in DARK.items())

@@ -182,6 +182,7 @@ class Judge:
             frames = self.segment.geometry.video_shape(1, voxels.temporal_merge)[0]
             return len(range(*self.frames(voxels).indices(frames))) // 2
         first = len(true) // 4
+        # in the middle half
         away = true[first : max(3 * first, first + 1)] - true.mean(axis=0)
         return first + int(np.argmax(np.square(np.where(away > 0, away, DIMMER * away)).sum(axis=(1, 2))))
 
@@ -210,6 +211,7 @@ def amplitude_error(video: NDArray[Any], truth: NDArray[Any]) -> float | None:
     swing = float(np.vdot(true, true))
     if swing < 1e-6 * float(np.vdot(truth, truth)):
         return None
+    # the regression's slope, which noise of the video does not bias
     return abs(float(np.vdot(true, video - video.mean(axis=0))) / swing - 1)
 
 
@@ -255,6 +257,7 @@ def measure(
     )
     prediction = None if np.isnan(result.quality.prediction) else result.quality.prediction
     last = Point(result.iterations, result.seconds, result.processor_s, "end", prediction=prediction)
+    # an observed result counts the making of its video, and may be later than the end
     earlier = (each for each in points if each.seconds < last.seconds)
     return Run(
         solver=solver,

@@ -125,6 +125,7 @@ def _shown(values: NDArray[np.float64], metric: Metric) -> NDArray[np.float64]:
 def _time_axis(ax: Axes, label: str) -> None:
     ax.set_xscale("log")
     low, high = ax.get_xlim()
+    # the middle of a logarithmic axis
     middle, octaves = np.sqrt(low * high), max(float(np.log2(high / low)), LEAST_OCTAVES)
     ax.set(xlim=(middle / 2 ** (octaves / 2), middle * 2 ** (octaves / 2)), xlabel=label)
     ax.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5) if octaves > MANY_OCTAVES else (1, 1.5, 2, 3, 5, 7)))

@@ -99,7 +99,8 @@ def write_page(
         writer = csv.DictWriter(file, fieldnames=list(rows[0]))
         writer.writeheader()
         writer.writerows(rows)
-    if study is not None and study.effects:
+    # lost lines are not compared with the noise: alone, they leave nothing to plot
+    if study is not None and any(worth.noises is not None for worth in study.effects):
         with mpl.rc_context(STYLE):
             drawings["effects"] = save_drawing(_effects(study), directory, "effects")
     page = directory / "index.html"

@@ -39,6 +39,7 @@ def _write(file: IO[bytes], array: Array, advance: Callable[[int], object]) -> N
         "fortran_order": False,
         "shape": array.shape,
     }
+    # the oldest version, which suffices for plain types
     npy.write_array_header_1_0(file, header)
     for _, block in array.blocks():
         file.write(np.ascontiguousarray(block).data)

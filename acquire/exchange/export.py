@@ -38,6 +38,7 @@ SUFFIXES = {
 def format_for(path: Path) -> str:
     """Return the format of a file name, a value of `SUFFIXES`. Raises UsageError if it has none."""
     for suffix, name in SUFFIXES.items():
+        # in the order of the table: .ome.tif comes before .tif, with which it ends, too
         if path.name.lower().endswith(suffix):
             return name
     raise UsageError(

@@ -37,6 +37,7 @@ def write_hdf5(path: Path, content: Content, advance: Callable[[int], object]) -
     with path.open("r+b") as opened:
         disk = _Disk(opened.fileno())
 
+        # the disk's error ends the export here and not when HDF5 closes the file, which would crash
         def advance_if_written(count: int) -> None:
             disk.check()
             advance(count)
@@ -134,6 +135,7 @@ def _group(parent: Any, name: str, kind: str, **attributes: str) -> Any:
 def _write_axis(data: Any, axis: Axis, count: int) -> None:
     """Write coordinates chunk by chunk, since there can be very many lines."""
     assert axis.step is not None
+    # line numbers are integers
     whole = axis.step == int(axis.step) and axis.first == int(axis.first)
     dataset = data.create_dataset(axis.name, (count,), "<i8" if whole else "<f8")
     dataset.attrs["units"] = axis.unit
@@ -148,6 +150,7 @@ def _write(data: Any, array: Array, advance: Callable[[int], object]) -> None:
     ahead = 1 if array.dims[0] == "arm" else 0
     row_bytes = array.dtype.itemsize * int(np.prod(array.shape[ahead + 1 :]))
     rows = min(array.shape[ahead], max(1, CHUNK_BYTES // row_bytes))
+    # never both arms in a chunk: they are written one after the other
     chunks = (*(1,) * ahead, rows, *array.shape[ahead + 1 :])
     dataset = data.create_dataset(array.name, array.shape, array.dtype, chunks=chunks)
     dataset.attrs.update(array.attributes)

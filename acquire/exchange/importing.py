@@ -105,6 +105,7 @@ def clock_of(line_rate_hz: float, substeps: int) -> tuple[int, int]:
     """Return ticks per second and per sub-step of a clock for a line rate, to a part in 10⁸ or better."""
     ticks = SUBSTEP_TICKS
     while line_rate_hz * substeps * ticks < 1e8:
+        # integers: more ticks per sub-step make the rounding of the rate smaller
         ticks *= 10
     return round(line_rate_hz * substeps * ticks), ticks
 
@@ -221,7 +222,7 @@ def shifted(code: Code, start: int) -> Code:
 
 def _unknown(arms: Mapping[str, Arm], instrument: Instrument) -> list[str]:
     """List what is not known about the lines. The texts are stored in the recording."""
-    found = ["the trigger's tags: code and time of every line follow from what was said at the import"]
+    found = ["the trigger's tags: code and time of every line follow from the arguments of the import"]
     found.append("lines that were lost before: a loss shifts the code of all that follow")
     if instrument.start_ns is None:
         found.append("UTC: the first line's is taken as 1970-01-01T00:00:00")

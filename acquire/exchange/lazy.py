@@ -62,6 +62,7 @@ class Stack:
             )
         found = np.empty((len(numbers), *self.shape[1:]), self.dtype)
         for place, number in zip(found, numbers.tolist(), strict=True):
+            # one by one: only the result has to fit into memory
             place[:] = self.picture(number)
         return found[(slice(None), *rest)]
 

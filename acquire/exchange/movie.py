@@ -49,6 +49,7 @@ def write_movie(
     """Write a movie of ``fps`` frames per second, grey from 0 to ``peak`` (None: close to the brightest)."""
     av = library("av", "video", "an MP4 file")
     white = peak or _white(content)
+    # by an integer, so that pixels stay equal squares
     times = max(1, USUAL_SIDE // max(content.image.shape[1:]))
     height, width = (side * times for side in content.image.shape[1:])
     known = {"left_out": [each.name for each in content.beside]} if content.beside else {}
@@ -61,9 +62,11 @@ def write_movie(
         stream.width, stream.height = width + width % 2, height + height % 2
         for _, block in content.image.blocks():
             for frame in block:
-                # The codec needs even sides, so an odd one repeats its last row or column.
-                grey = np.rint(np.clip(frame.astype(np.float32) * (255 / white), 0, 255)).astype(np.uint8)
+                # NaN, as in tiles that were not reached, has no grey value
+                light = np.nan_to_num(frame.astype(np.float32))
+                grey = np.rint(np.clip(light * (255 / white), 0, 255)).astype(np.uint8)
                 large = grey.repeat(times, axis=0).repeat(times, axis=1)
+                # The codec needs even sides, so an odd one repeats its last row or column.
                 even = np.pad(large, [(0, side % 2) for side in large.shape], mode="edge")
                 picture = av.VideoFrame.from_ndarray(even, format="gray")
                 container.mux(stream.encode(picture))
@@ -79,5 +82,7 @@ def _white(content: Content) -> float:
         # A step that has a factor in common with the width would never see some of the columns.
         steps = count(max(1, block.size // SAMPLED))
         some = block.reshape(-1)[:: next(step for step in steps if gcd(step, columns) == 1)]
-        found.append(float(np.quantile(some, PEAK_QUANTILE)))
+        known = some[np.isfinite(some)]
+        if known.size:
+            found.append(float(np.quantile(known, PEAK_QUANTILE)))
     return max(found) or 1.0

@@ -113,6 +113,7 @@ def _name(path: object) -> str:
 def _window(file: VideoFile) -> tuple[float, float]:
     """Return the black and white levels recorded in the video; for an older one, from some of its frames."""
     channels = file.attrs["ome"].get("omero", {}).get("channels", ())
+    # there is one channel, and in older videos none
     for channel in channels:
         return float(channel["window"]["start"]), float(channel["window"]["end"])
     return _limits(frames(file, range(len(file.time_ns))))

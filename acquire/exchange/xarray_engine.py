@@ -46,6 +46,7 @@ class AcquireBackend(BackendEntrypoint):
             if group is not None:
                 raise UsageError(f"{place} has no group {group!r}", possible="none: a video has no groups")
             levels = open_video(place).attrs["ome"]["multiscales"][0]["datasets"]
+            # viewers' smaller copies of the image have other axes, which a dataset cannot hold under one name
             smaller = [str(level["path"]) for level in levels[1:]]
             store = source_of(place).zarr_store()
             # With chunks=None xarray reads lazily without dask, which may not be installed.

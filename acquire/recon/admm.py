@@ -83,10 +83,13 @@ class Admm:
         self._denoiser = Checked(denoiser) if denoiser else tv
         self._xp, arrays = namespace(samples), basis.arrays
         self._emphasis = arrays.asarray(emphasis)
+        # λ/ρ per frame: the split's prox has λ·TV over ρ/2·‖·‖²
         self._strength = self._emphasis * (parameters.tv_weight / parameters.tv_penalty)
+        # before `rebase`, which lifts it
         self._w = arrays.zeros(samples.shape)
         self.rebase(operator, basis, arrays.zeros(theta_shape) if start is None else start)
         self._tv_multiplier = arrays.zeros(theta_shape)
+        # where the start is, not 0: the first data step would otherwise draw a warm start to darkness
         self._sign = self._xp.maximum(self._xp.tensordot(self._grid.T, self.theta, axes=1), self._least)
         self._sign_multiplier = arrays.zeros(self._sign.shape)
 
@@ -97,6 +100,7 @@ class Admm:
         follow slowly.
         """
         self._operator, self.theta = operator, basis.arrays.asarray(theta)
+        # in cosines, also for a basis of fewer curves: on fewer instants its rows would not be orthonormal
         grid = min(basis.frames, self._parameters.grid_per_coefficient * basis.cosines)
         self._grid = basis.arrays.asarray(basis.matrix(grid))
         background = self._background
@@ -179,6 +183,7 @@ class Admm:
         centre /= rho
         # y − W·B·c − (W·B·BᵀW + ρ)·w, with a single product, since `_lifted` is BᵀW·w
         residual = self._samples - self._operator.forward(centre + self._lifted) - rho * self._w
+        # checked here: a NaN would end `_descend` as a residual of 0 does, without a word
         if not self._xp.isfinite(dot(residual, residual)):
             raise NumericsError(
                 "ADMM diverged: its iterates are not finite", hint="check the segment's samples and weights"
@@ -190,6 +195,7 @@ class Admm:
     def _descend(self, residual: Array, rho: float) -> None:
         """Make conjugate-gradient steps on (W·B·BᵀW + ρ)·w; ``residual`` is overwritten."""
         scaled = self._precondition(residual)
+        # a copy: without a preconditioner `scaled` is the residual itself, which changes in place
         direction, energy = self._xp.asarray(scaled, copy=True), dot(residual, scaled)
         # squared, as the energy is
         enough = self._parameters.gradient_share**2 * energy

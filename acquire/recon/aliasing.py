@@ -69,6 +69,7 @@ def detect_unresolved_light(
     count = int(SHARE * span)
     residual = np.where(problem.usable, problem.samples - predicted, 0)
     patterns = _patterns(video, segment.geometry.size)
+    # without a window of cosines beyond the band there is nothing that light could stand out of
     if first + WINDOW > count or not patterns or not residual.any():
         return ()
     basis = TemporalBasis(span, count)
@@ -102,8 +103,10 @@ def _patterns(video: NDArray[Any], size: int) -> list[NDArray[np.float32]]:
         strip = np.zeros_like(mean)
         strip[rows] = mean[rows]
         across = np.zeros_like(mean)
+        # frames are square: the indices of rows are those of columns, too
         across[:, rows] = mean[:, rows]
         strips += [strip, across]
+    # `CurveOperator` takes fine pixels; a voxel is held over its block
     merge = -(-size // side)
     held = [each.repeat(merge, axis=0).repeat(merge, axis=1)[:size, :size] for each in strongest + strips]
     found = [each.astype(np.float32) for each in held]

@@ -198,6 +198,7 @@ class _Run:
         check = check and self.options.static_image is None and clock.ended != "stopped"
         checked = check_description(segment, quality, clock) if check else DescriptionCheck()
         facts = estimate.facts()
+        # solvers without a band are free in every frame
         cosines = facts.get("temporal_coefficients", len(video))
         # K cosines over a span resolve K/(2·span)
         resolved_hz = cosines / (2e-9 * segment.substep_ns * T_m * len(video))

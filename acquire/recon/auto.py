@@ -59,6 +59,7 @@ def tempo(
             progress(len(tried) / most)
 
     geometry = segment.geometry
+    # S fine pixels are one pixel of the camera
     side = min(side or geometry.substeps, geometry.size)
     still = _error(segment, Voxels(1, geometry.span))
     tried = [(0, still)]
@@ -72,6 +73,8 @@ def tempo(
         done()
         if error * BETTER <= best:
             best, chosen = error, Voxels(side, merge)
+        # light that is faster than the long frames makes those no better than a still: until one beats the
+        # still, shorter ones may
         elif chosen.temporal_merge < geometry.span:
             break
     return Tempo(chosen, tuple(tried))

@@ -84,6 +84,7 @@ def balance_of(segments: Sequence[Segment]) -> Balance | None:
     share is added to the error.
     """
     seen = [each for each in map(_light, segments) if each is not None]
+    # a wrong black level would add up line by line, as light does
     if not seen or any(black_level_off(segment) for segment in segments):
         return None
     known = [np.stack([np.cumsum(light.lines[0]), light.lines[0]], axis=1) for light in seen]

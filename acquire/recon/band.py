@@ -85,12 +85,15 @@ class BandOperator:
         self._registration = registration(alignment, geometry, spatial_merge, basis.arrays)
         starts, lengths = block_bounds(geometry.size, spatial_merge)
         lit = lit_cosines(code, basis, temporal_merge)
+        # arm B's rows are the scene's columns from right to left: the factor has them in that order, so that
+        # the view of the frames need not be reversed
         flipped = geometry.size - starts - lengths
         factors = [staircase(lit, order, lengths, geometry) for order in (starts, flipped)]
         mergings: list[NDArray[Any]] = [merging, merging]
         if blur is not None:
             # along the transfer the blur goes into the factor, across it into the merging: it costs no time
-            # per frame
+            # per frame. The matrices are those of the scene's rows and columns; arm B's charge moves along
+            # the latter.
             (along_a, across_a), (across_b, along_b) = blur_matrices(blur, geometry.size, spatial_merge)
             factors = [
                 np.einsum("lqk,qp->lpk", factor, along.astype(factor.dtype), optimize=True)
@@ -208,7 +211,8 @@ def staircase(
         # times fewer of those: they are summed once, and then copied.
         sums = np.zeros((len(lit) - steps + 1, K), lit.dtype)
         for d in range(steps):
-            # in lit's dtype: one of numpy's int64 would make the products float64
+            # number of rows r of the block and steps u of the line with r + u = d; in lit's dtype, because
+            # one of numpy's int64 would make the products float64
             multiplicity = lit.dtype.type(min(d + 1, length, S, length + S - 1 - d))
             sums += multiplicity * lit[d : d + len(sums)]
         blocks = np.flatnonzero(lengths == length)

@@ -65,9 +65,11 @@ def estimate_coefficients(
     spatial_merge, temporal_merge = merges
     frames = segment.geometry.video_shape(spatial_merge, temporal_merge)[0]
     most = int(LARGEST_SHARE * frames)
+    # the answer would be the same whatever the lines show
     if most <= FEWEST_COEFFICIENTS:
         return min(frames, FEWEST_COEFFICIENTS)
     merge = max(spatial_merge, -(-segment.geometry.size // COARSE_SIDE))
+    # whatever the dtype of the video: only the end of the signal is wanted
     arrays = replace(problem.arrays, dtype="float32")
     theta = _tentative(segment, (merge, temporal_merge), most, hurry, arrays)
     last = _end_of_signal(np.square(theta, dtype=np.float64).sum((1, 2)))
@@ -113,6 +115,7 @@ def _tentative(
     merge, temporal_merge = merges
     frames, side, _ = segment.geometry.video_shape(merge, temporal_merge)
     basis = TemporalBasis(frames, count, arrays)
+    # all samples: nothing is judged by prediction here
     problem = build_problem(segment, merge, temporal_merge, hold_out=0.0, arrays=arrays)
     operator = problem.masked(
         band_operator(
@@ -134,4 +137,5 @@ def _end_of_signal(energy: NDArray[np.float64]) -> int:
     if floor.max() > PEAK * np.median(floor):
         return len(energy)
     above = np.flatnonzero(energy > floor.max())
+    # nothing above the floor: it may be none, and in doubt the band is wide
     return int(above[-1]) + 1 if len(above) else len(energy)

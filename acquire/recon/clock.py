@@ -116,6 +116,7 @@ class IterationClock:
             needed_s, after_s = SLOWER * self.longest_s, self.mean_s if made >= least else 0.0
             if repeat:
                 one_s = self.mean_s or expected_s
+                # the second pass, and what the first still lacks of ``repeat``
                 passes = max(repeat, made + 1) + max(repeat - made - 1, 0)
                 needed_s = max(needed_s, one_s) + one_s * passes
             if self.stop_requested or not self._fits(needed_s, after_s):
@@ -147,7 +148,7 @@ class IterationClock:
         last = min(self.done + most, self.iterations)
         expected, before = self.longest_s, self._recent_s
         if stage != self._stage:
-            # a stage that goes on knows its longest iterations; a new one has others
+            # a stage that continues has measured its iterations; those of a new one are different
             expected, self._recent_s = first * expected, deque(maxlen=REMEMBERED)
         while self.done < last and self._may_continue(expected, share):
             begun = self.seconds
@@ -208,6 +209,7 @@ class IterationClock:
         self.made += 1
         self._recent_s.append(seconds)
         if self._progress is not None:
+            # trials count as made, and may outnumber the limit: never more than the whole is done
             self._progress(Progress(self.made, max(self.made, self.iterations), self.seconds, stage))
 
     def _fits(self, seconds: float, iteration_s: float, share: float = 1.0) -> bool:
@@ -215,6 +217,7 @@ class IterationClock:
         if self._budget_s is None:
             return True
         finish_s = FINISH_SHARE * self._budget_s + FINISH_ITERATIONS * iteration_s
+        # by the mean: only some iterations, as every fifth of a refinement, are as long as the longest
         finish_s += min(self._reserved * self.mean_s, RESERVED_SHARE * self._budget_s)
         return self.seconds + seconds <= min(share * self._budget_s, self._budget_s - finish_s)
 

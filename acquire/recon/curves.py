@@ -134,11 +134,13 @@ class CurveFit:
         """
         cosines, rank = start.shape
         samples = np.count_nonzero(self._problem.weight)
+        # as if the masked samples were spread evenly, which is near enough for a preconditioner and a prior
         gram *= samples / self._problem.weight.size / self._problem.norm**2
         self._damping = max(self._ridge * float(np.trace(gram)) / len(gram), float(np.finfo(np.float32).tiny))
         # in the order of `gram`: all cosines of a pattern, then those of the next
         before, slope = start.T.ravel().astype(np.float64), gradient.T.ravel().astype(np.float64)
         if self._learns and self.prior is None and start.any():
+            # to begin with, the curves as they are and all of the residual as noise
             self.prior = CurvePrior(np.square(start, dtype=np.float64).mean(1), energy / samples)
         diagonal = np.diag_indices_from(gram)
         for _ in range(EVIDENCE_STEPS if self._learns else 1):

@@ -37,10 +37,12 @@ class DescriptionCheck:
 
 def check_description(segment: Segment, quality: Quality, clock: IterationClock) -> DescriptionCheck:
     """Find a description that explains the lines better than the segment's own, if there is one."""
+    # very few lines have no held-out samples, and a prediction that is NaN
     residual = float(np.nanmax([quality.misfit, quality.prediction]))
     if not residual > SUSPICIOUS or not clock.affords(SECONDS):
         return DescriptionCheck()
     found = diagnose(segment)
+    # some right descriptions are unclear: what is uncertain is not a contradiction
     believed = found.standing in (Standing.RIGHT, Standing.UNCLEAR)
     words = found.sentences
     if found.standing is Standing.RIGHT and residual > POOR_MISFIT:

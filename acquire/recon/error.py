@@ -199,6 +199,7 @@ def combined_facts(parts: Sequence[Mapping[str, Any]], weights: Sequence[float])
     for part in parts:
         if "unknown" in part:
             return dict(part)
+    # mean squares add up, RMS errors do not
     found = {
         key: float(np.sqrt(np.average([part[key] ** 2 for part in parts], weights=weights)))
         for key in ("rms", "low", "high")
@@ -226,7 +227,7 @@ def measure_indicators(
     scale = full_scale(shown)
     if not (scale > 0 and residual > 0):
         return None
-    # ratios and logarithms are taken of what follows: none of it may be 0
+    # what follows enters ratios and logarithms, so that none of it may be 0
     floor = exponents.floor * scale
     change, edge = shown - shown.mean(0), np.zeros_like(shown)
     edge[:, :-1] += np.square(np.diff(shown, axis=1))
@@ -274,6 +275,7 @@ def error_from(indicators: Indicators, trusted: slice, exponents: Exponents | No
 
 def log_indicators(sensitivity: float, indicators: Indicators) -> NDArray[np.float64]:
     """Logarithms of the whole video's indicators over the residual, one for each of ``Exponents.whole``."""
+    # relative to the residual, by which the product is multiplied: its degree is 1 whatever the exponents
     log_ratio = np.log(sensitivity / indicators.residual)
     excess = max(log_ratio, 0.0)
     fine = indicators.fine

@@ -108,6 +108,7 @@ def estimate_error(
 
 def _with_fewer_lines(problem: Problem, estimate: Continuable, clock: IterationClock) -> Continued | str:
     """The video with another quarter of the lines withheld."""
+    # blocks of their own: those that the solver was judged by are in use meanwhile
     withheld = held_out_blocks(problem.usable, WITHHELD, WITHHELD_SEED)
     continuation = estimate.continue_with(problem.holding_out(withheld))
     if continuation is None:
@@ -135,6 +136,7 @@ def _under_heavier_prior(
     drift = _drift_exponent(distances, BY_PRIOR.floor * full_scale(video[trusted]))
     if drift is None:
         drift = ASSUMED_DRIFT if clock.ended == "budget" else 0.0
+    # a negative drift is that of a solver that converges: its change is not extrapolated to a smaller one
     return Continued(continuation.video(), made, max(drift, 0.0), drift)
 
 
@@ -177,7 +179,8 @@ def white_error(segment: Segment, problem: Problem, residual: float, merges: tup
     operator = DualArm(
         segment.geometry, segment.code, *merges, alignment=segment.alignment, blur=segment.blur
     )
-    # ±1 has an RMS of exactly 1; from int8 and in place, because a video can be large
+    # random signs show the energy of independent errors, Σ of Λ′'s squared elements, without the matrix, and
+    # their RMS is exactly 1; from int8 and in place, because a video can be large
     signs = np.random.default_rng(0).integers(0, 2, operator.video_shape, np.int8).astype(np.float32)
     signs *= 2
     signs -= 1

@@ -77,6 +77,7 @@ class InBand:
         return host(self.basis.synthesize(self.solver.theta))
 
     def facts(self) -> dict[str, Any]:
+        # the count is what `reconstruct` derives ``resolved_hz`` from
         return {"temporal_coefficients": self.basis.count} | asdict(self._parameters)
 
     def step(self) -> None:

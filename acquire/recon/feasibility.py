@@ -37,6 +37,7 @@ def least_seconds(geometry: Geometry, spatial_merge: int, temporal_merge: int, s
     operator = DualArm(few, code, spatial_merge, min(temporal_merge, few.span))
     video = np.ones(operator.video_shape, np.float32)
     operator.adjoint(operator.forward(video))  # loads the compiled loops
+    # processor time, which a busy machine does not stretch; `slowness` says by how much wall time is longer
     used, passes = time.thread_time(), 0
     while passes < 1 or time.thread_time() - used < LOOK_S:
         operator.adjoint(operator.forward(video))

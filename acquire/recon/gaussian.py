@@ -85,6 +85,7 @@ class Response:
         running = np.concatenate([np.zeros((1, FAST)), np.cumsum(lit, axis=0)])
         windows = running[substeps:] - running[:-substeps]
         running = np.concatenate([np.zeros((1, FAST)), np.cumsum(windows, axis=0)])
+        # summed twice, the light of any range of rows is a difference of two elements
         first = (np.arange(lines) * substeps)[:, None]
         # float32: the products with these take most of the time, and the noise is far above its rounding
         tiers = ((0, FINE, pixels * finer), (FINE, SLOW, pixels), (SLOW, FAST, min(pixels, FAST_ROWS)))

@@ -61,6 +61,7 @@ def _drawn(
     tiles = [-(-length // side) + 1 for length, side in zip(shape, size, strict=True)]
     count = tiles[0] * tiles[1]
     chosen = np.zeros(count, bool)
+    # rounded at random, so that the share is right on average even if there are few tiles
     chosen[rng.permutation(count)[: int(count * share + rng.random())]] = True
     begin = [int(rng.integers(side)) for side in size]
     whole = chosen.reshape(tiles).repeat(size[0], axis=0).repeat(size[1], axis=1)

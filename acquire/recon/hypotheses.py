@@ -177,6 +177,7 @@ class LineModel:
                 _displaced(a, self._size, self._alignment.to_a),
                 _displaced(b, self._size, self._alignment.to_b),
             )
+        # what arm B saw predicts arm A, and the other way round
         scenes = (b, turn.to_b(a))
         gain = [view.gain(arm, each) for arm, (view, each) in enumerate(zip(views, scenes, strict=True))]
         return Evidence(np.concatenate(own), np.concatenate(gain))
@@ -196,6 +197,7 @@ class LineModel:
         code = self._bits(substeps * self.first - late, span).astype(np.float64)
         if random_code:
             code = np.random.default_rng(random_code).integers(0, 2, span).astype(np.float64)
+        # a multiple of the pixels, since the arms exchange rows and pixels
         finer = max(1, min(rows, MOST_BLOCKS) // self.pixels)
         lit = 1 - code if inverted else code
         return Response(lit, rows, substeps, self.lines, self.pixels, finer)

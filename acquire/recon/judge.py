@@ -42,11 +42,13 @@ def frame_error(
     per_line = np.stack(
         [np.square(error).sum((0, 2)), np.square(np.where(usable, problem.samples, 0.0)).sum((0, 2))]
     )
+    # a frame is seen by n/S lines and more: differences of running sums instead of sums of their own
     running = np.concatenate([np.zeros((2, 1)), np.cumsum(per_line, axis=1)], axis=1)
     # the lines whose exposure overlaps each frame are first .. last − 1
     S, L = geometry.substeps, geometry.lines
     begins = np.arange(0, geometry.span, temporal_merge)
     ends = np.minimum(begins + temporal_merge, geometry.span)
+    # line ℓ exposes the sub-steps ℓS .. ℓS + n + S − 2
     first = np.clip(-(-(begins - (geometry.size + S - 2)) // S), 0, L)
     last = np.clip((ends - 1) // S + 1, 0, L)
     residual, level = running[:, last] - running[:, first]

@@ -83,6 +83,7 @@ def _dual_step(
     branches and the compiler can use vector instructions.
     """
     rows, columns = x.shape
+    # 8 bounds the squared norm of the differences along two axes: a longer step may diverge
     one, step = x.dtype.type(1), x.dtype.type(1) / (x.dtype.type(8) * weight)
     for r in range(rows - 1):
         for c in range(columns - 1):
@@ -193,6 +194,7 @@ def tv_value(frames: NDArray[Any], out: NDArray[np.float64]) -> None:
         for r in range(rows):
             for c in range(columns):
                 x = frames[k, r, c]
+                # x − x, not 0.0, which would make both branches float64
                 down = frames[k, r + 1, c] - x if r < rows - 1 else x - x
                 right = frames[k, r, c + 1] - x if c < columns - 1 else x - x
                 total += np.sqrt(down * down + right * right)

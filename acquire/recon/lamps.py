@@ -139,6 +139,7 @@ def _relative_energy(
         if not (light * explained).max() < largest:
             # rounding error: under a code that hardly changes, the lines do not separate cosines
             return np.zeros(K)
+        # the root is that of the minorisation: the likelihood rises in every step, whatever the start
         light *= np.sqrt(explained / (samples_each * expected))
         left = np.square(white, dtype=np.float64).sum() / samples_each
         noise = max(LEAST_NOISE, noise * float(np.sqrt(left / trace)))
@@ -203,6 +204,7 @@ def _left_out(
     """For one cosine (rows, L_R): energy that it explains if C is without it, relative to that by chance."""
     own = (flat @ inverse @ flat.T).astype(np.float64)
     # F_kᵀ·(C − p·F_k·F_kᵀ)⁻¹ = (I − p·F_kᵀ·C⁻¹·F_k)⁻¹·F_kᵀ·C⁻¹
+    # slightly more than 1, because a cosine that is all of C would make it singular
     without = np.linalg.inv((1 + 1e-6) * np.eye(len(own)) - light * own)
     expected = float(np.einsum("ij,ji->", without, own))
     explained = float(np.square(without.astype(np.float32) @ (flat @ white)).sum(dtype=np.float64))

@@ -75,6 +75,7 @@ class SolveOptions:
         """Raise UsageError unless the given arrays are finite and fit the segment."""
         _check_array("initial video", self.initial, video_shape)
         _check_array("static image", self.static_image, (size, size))
+        # the curve is relative to the image's norm
         if self.static_image is not None and not np.any(self.static_image):
             raise UsageError(
                 "the static image is dark everywhere", possible="an image of the lit scene at rest"

@@ -5,7 +5,8 @@ are tolerant: a sample is an outlier only if no scene explains it.
 
     not finite    NaN or infinite
     spike         far from the median of its column's neighbouring lines, which share nearly all their light
-    hot column    its median is many times that of nearly all columns
+                  unless it is that of a few rows, and far from what the column has in most lines
+    hot column    its median is many times that of nearly all columns, and not that of a small lamp's light
     stuck column  the same value in every line, while columns vary
 """
 
@@ -23,7 +24,12 @@ SPIKE_LINES = 5
 SPIKE_DEVIATIONS = 20.0
 SPIKE_LEVEL = 0.5
 """Smallest height of a spike, relative to the samples' 99th percentile, so that quiet scenes have none."""
+FENCE = 1.5
+"""Distance of a spike from the middle half of its column's samples, in their range (Tukey's inner fences)."""
 HOT_RATIO = 10.0
+STEADY = 0.5 / 3**0.5
+"""Relative standard deviation of a hot column's lines at most, times √M: light under a random code varies by
+1/√(S·M) if it fills all rows, as a slit, and more if it fills fewer; defects need not vary at all."""
 FEWEST_VARYING = 0.1
 """Share of an arm's columns that must vary for a constant one to be suspicious."""
 FEWEST_TOGETHER = 3
@@ -45,19 +51,40 @@ def outliers(samples: NDArray[Any], mask: NDArray[np.bool_]) -> dict[str, NDArra
 def _spikes(samples: NDArray[np.float64], left: NDArray[np.bool_]) -> NDArray[np.bool_]:
     if samples.shape[1] < SPIKE_LINES or not left.any():
         return np.zeros_like(left)
+    # along lines only: neighbouring lines share their light, neighbouring columns need not
     deviation = np.abs(samples - median_filter(samples, size=(1, SPIKE_LINES, 1), mode="nearest"))
     # standard deviation of normal noise with this median
     spread = 1.4826 * np.median(deviation[left])
     level = np.quantile(np.abs(samples[left]), 0.99)
-    return np.asarray(deviation > SPIKE_DEVIATIONS * spread + SPIKE_LEVEL * level)
+    far = SPIKE_DEVIATIONS * spread + SPIKE_LEVEL * level
+    found = np.asarray(left & (deviation > far))
+
+    # Of a lamp of a few rows, neighbouring lines share hardly any light: they differ by as much as all do.
+    for arm, column in np.argwhere(found.any(axis=1)):
+        values = samples[arm, :, column]
+        low, high = np.quantile(values[left[arm, :, column]], (0.25, 0.75))
+        fence = FENCE * (high - low) + far
+        found[arm, :, column] &= np.maximum(values - high, low - values) > fence
+    return found
 
 
 def _hot(samples: NDArray[np.float64], left: NDArray[np.bool_]) -> NDArray[np.bool_]:
     if samples.shape[1] < FEWEST_LINES:
         return np.zeros_like(left)
     medians = np.median(np.abs(samples), axis=1, keepdims=True)
+    # of nearly all columns, not of the middle one: most of a scene may be dark
     usual = np.quantile(medians, 0.9, axis=2, keepdims=True)
-    return np.asarray(np.broadcast_to((medians > HOT_RATIO * usual) & (usual > 0), samples.shape))
+    bright = (medians > HOT_RATIO * usual) & (usual > 0)
+    if not bright.any():
+        return np.zeros_like(left)
+
+    # A lamp or a slit on dark ground is in few columns, too. It follows the code, and both arms see all of
+    # its light: their totals agree better with it than without it. By medians, which spikes do not change.
+    follows = bright & (samples.std(axis=1, keepdims=True) > STEADY / samples.shape[2] ** 0.5 * medians)
+    total, without = medians.sum(axis=2, keepdims=True), (medians * ~follows).sum(axis=2, keepdims=True)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        seen_by_both = np.abs(np.log(total / total[::-1])) < np.abs(np.log(without / total[::-1]))
+    return np.asarray(np.broadcast_to(bright & ~(follows & seen_by_both), samples.shape))
 
 
 def _stuck(samples: NDArray[np.float64], left: NDArray[np.bool_]) -> NDArray[np.bool_]:
@@ -75,6 +102,7 @@ def _stuck(samples: NDArray[np.float64], left: NDArray[np.bool_]) -> NDArray[np.
     dark = still & (np.abs(high - darkness) <= 1e-3 * brightest)
     # a single dark column between lit ones is stuck: dark parts of a scene are mostly wider
     lit = np.median(np.abs(samples), axis=1, keepdims=True) > 0.1 * brightest
+    # an outermost column has one neighbour: itself stands for the other
     padded = np.pad(lit, ((0, 0), (0, 0), (1, 1)), mode="edge")
     lonely = dark & padded[:, :, :-2] & padded[:, :, 2:]
     return np.asarray(np.broadcast_to(still & usual & (~dark | lonely), samples.shape))

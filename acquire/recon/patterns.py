@@ -99,6 +99,7 @@ def find_patterns(theta: NDArray[Any], *, beyond_doubt: bool = False) -> Pattern
     if count <= TAIL:
         return None
     flat = theta.reshape(count, -1).astype(np.float64)
+    # of a K × K matrix: there are many more pixels than cosines
     energy, vectors = np.linalg.eigh(flat @ flat.T)
     energy, vectors = np.maximum(energy[::-1], 0), vectors[:, ::-1]
     # energies are squares of singular values, for whose ratios the limits are given
@@ -107,7 +108,7 @@ def find_patterns(theta: NDArray[Any], *, beyond_doubt: bool = False) -> Pattern
     if not _is_enough(rank, energy, LARGEST_REST_AT_GAP):
         if beyond_doubt:
             return None
-        # Noise has most of the singular values to itself, and a share of each; of few it cannot be told.
+        # Noise has most of the singular values to itself, and a share of each; few do not determine it.
         noise = np.median(energy) if count >= LEAST_FOR_NOISE else 0.0
         rank = _above_floor(energy[:TAIL], noise)
         if not _is_enough(rank, energy - noise, LARGEST_REST):
@@ -152,6 +153,7 @@ class Refinement:
         self.loosens = True
         self._fit = CurveFit(segment, problem, cosines, temporal_merge, RIDGE, learns=True)
         n = segment.geometry.size
+        # a voxel held over its pixels; the last may stand out of the picture
         fine = found.patterns.repeat(merge, axis=1).repeat(merge, axis=2)[:, :n, :n]
         self._start(Patterns(found.curves, fine))
 
@@ -161,6 +163,7 @@ class Refinement:
         operator, basis = self._operators()
         fine = host(found.patterns)
         size = np.sqrt(np.square(fine, dtype=np.float64).sum((1, 2)))
+        # 1e-6: of a pattern that has faded altogether the weight stays finite
         emphasis = (size.max() / np.maximum(size, 1e-6 * size.max() + 1e-30)) ** FADING
         self._admm = Admm(
             operator,
@@ -297,6 +300,7 @@ class Refinement:
         patterns, arrays, exact = self.found.patterns, self._problem.arrays, self._problem.arrays.exact()
         flat = exact.xp.reshape(exact.asarray(patterns), (self.rank, -1))
         gram = host(flat @ flat.T)
+        # the ridge keeps patterns that have become alike, or dark, from making it singular
         root = np.linalg.cholesky(gram + 1e-6 * np.trace(gram) * np.eye(self.rank))
         # orthonormal patterns make the fit well conditioned; the curves take over their sizes for it
         unit = arrays.xp.reshape(arrays.asarray(exact.asarray(np.linalg.inv(root)) @ flat), patterns.shape)

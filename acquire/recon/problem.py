@@ -143,6 +143,7 @@ def _relative_rms(predicted: NDArray[Any], samples: NDArray[Any], where: NDArray
     if not where.any():
         return float("nan")
     error, level = np.linalg.norm((predicted - samples)[where]), np.linalg.norm(samples[where])
+    # in darkness there is nothing to be relative to
     return float(error / level) if level > 0 else float(error)
 
 
@@ -206,11 +207,13 @@ def build_problem(
         alignment=segment.alignment,
         blur=segment.blur,
     )
+    # an upper bound, within 0.3 % after five steps; power iteration ends below the norm, and TwIST diverges
     norm = operator.norm_bound(steps=5)
     flat = operator.forward(np.ones(operator.video_shape, np.float32))
     scale = _scale(samples[usable], flat[usable])
     # drawn by a seed, so that runs on the same lines are judged by the same samples
     held_out = held_out_blocks(usable, hold_out, seed)
+    # of very few samples none can be spared
     if not (usable & ~held_out).any():
         held_out = np.zeros_like(usable)
     return Problem(

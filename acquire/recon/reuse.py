@@ -62,6 +62,7 @@ class Choice:
     def of(cls, result: Reconstruction) -> Self | None:
         """The choice of a reconstruction; None if nothing was chosen, or if it depends on an object there."""
         found, quality = result.parameters, result.quality
+        # robust weights and a change's still are of this segment's lines
         if "candidates" not in found or found.get("robust") or found.get("change"):
             return None
         counts = [each["temporal_coefficients"] for each in found["candidates"] if each["prior"] == COSINES]

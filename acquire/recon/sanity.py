@@ -64,6 +64,7 @@ def _stuck(arm: str, lines: Floats, count: int) -> list[Suspicion]:
     if count == 1 or not highest.any():
         return []
     still = lowest == highest
+    # a constant column at the lowest level may be dark, and is no evidence
     lit = ~still | (highest > lowest.min())
     if still.all() or still[lit].mean() > STUCK_SHARE:
         share = 1.0 if still.all() else float(still[lit].mean())

@@ -177,6 +177,7 @@ def _search(model: LineModel, plain: Hypothesis) -> tuple[Candidate, tuple[Candi
     chance = ByChance.of(model, plain)
     described = chance.judged(_contrast(model, plain))
     found = []
+    # two: at delays three apart, or turned scenes that look alike, the right orientation may be second
     for start in _first_look(model, plain)[:2]:
         climbed = _climb(model, start.hypothesis)
         found.append(described if climbed == plain else chance.judged(_contrast(model, climbed)))
@@ -202,6 +203,7 @@ class ByChance:
             _contrast(model, replace(plain, random_code=number)) for number in range(1, RANDOM_CODES + 1)
         ]
         own = np.array([each.evidence.own.sum() for each in found])
+        # the most that chance reached, not its mean: a code has to be clear of all of them
         contrast = max(each.contrast for each in found)
         gain = max(each.gain for each in found)
         floor = LEAST_CONTRAST
@@ -254,6 +256,7 @@ def _climb(model: LineModel, start: Hypothesis) -> Hypothesis:
             known[late] = float(model.evidence(replace(start, late=late)).mutual.sum())
         return known[late]
 
+    # both climbs try some of the same delays
     known: dict[tuple[int, int], float] = {}
     common = _uphill(gain, start.late, ((3, 3), (1, 1)))
     apart = _uphill(gain, common, ((3, 0), (0, 3), (1, 0), (0, 1)))

@@ -128,7 +128,8 @@ class Stream:
         S, T_m = self.substeps, stretch.voxels.temporal_merge
         begin, end = stretch.begin - fade_in, stretch.end + fade_out
         if self.is_slow(stretch.voxels):
-            first_line = max(self.first_line, begin // S)
+            # of the sub-steps after the last line has begun, it is the only one that sees any
+            first_line = min(max(self.first_line, begin // S), self.end_line - 1)
             # the sub-steps of a line: the last line has to end within the stretch
             exposed = self.geometry(1).span
             end_line = -(-(end - exposed) // S) + 1
@@ -137,6 +138,7 @@ class Stream:
             frames = -(-(end - S * first_line) // T_m)
             # what the first row shows in sub-step t is in line t // S, so that lines go up to the frames' end
             end_line = first_line - (-frames * T_m // S)
+        # a stretch shorter than its lines' exposure has at least one of them
         lines = max(1, min(self.end_line, end_line) - first_line)
         return SubSegment(stretch.begin, stretch.end, stretch.voxels, first_line, lines, fade_in, fade_out)
 
@@ -163,6 +165,7 @@ class Stream:
         for before, after in pairwise(stretches):
             if before.end != after.begin:
                 raise UsageError(f"a stretch ends at sub-step {before.end}, the next begins at {after.begin}")
+        # 0 for slow ones: no seam with them fades
         lengths = [
             0 if self.is_slow(stretch.voxels) else stretch.end - stretch.begin for stretch in stretches
         ]
@@ -244,6 +247,7 @@ class Grid:
         have, want = segment.voxels.spatial_merge, self.voxels.spatial_merge
         if have == want:
             return timed
+        # the last voxel of a side may be narrower
         edges = [np.append(np.arange(0, self.size, merge), self.size) for merge in (have, want)]
         # one axis after the other, since voxels are products of intervals
         rows = _means(np.moveaxis(timed, 1, 0), *edges)  # (row, t, column)
@@ -275,6 +279,7 @@ def _rise(edges: NDArray[np.int64], seam: int, fade: int) -> NDArray[np.float64]
 
 def _means(values: NDArray[np.float32], have: NDArray[np.int64], want: NDArray[np.int64]) -> NDArray[Any]:
     """Means over ``want[i] .. want[i+1]`` of values held over ``have[j] .. have[j+1]``, along axis 0."""
+    # a matrix with a row for each of ``want`` and a column for each of ``have``
     low, high = np.maximum.outer(want[:-1], have[:-1]), np.minimum.outer(want[1:], have[1:])
     overlap = np.maximum(high - low, 0).astype(np.float32)
     total = overlap.sum(axis=1, keepdims=True)

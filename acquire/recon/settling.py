@@ -2,7 +2,7 @@
 
     doubtful patterns on trial ─▶ λ is lowered until noise is fitted ─▶ those left on trial ─▶ λ is held
 
-The first look tells patterns from its own errors by their energy alone, and may find too many. Superfluous
+The first look distinguishes patterns from its own errors only by energy, and may find too many. Superfluous
 ones fit noise: the picture loses 2 to 10 dB while the lines are explained. The held-out samples end the
 refinement, and the round that predicted them best is the result: at full resolution there is no model error
 to fit, so that they are predicted better as long as the picture improves. Next to the noise they rise and
@@ -57,12 +57,14 @@ def settle(refinement: Refinement, problem: Problem, clock: IterationClock) -> R
     if course.settles(clock, LOOSENED_IN_VAIN, TRIAL_AFTER * ROUND):
         course.hold(course.likely_weight)
     course.go_on_with(_without_doubtful(course.refinement, problem, clock))
+    # not held yet if no noise was fitted within `TRIAL_AFTER` rounds
     if course.refinement.loosens and course.settles(clock, LOOSENED_IN_VAIN):
         course.hold(course.likely_weight)
     while course.settles(clock, PATIENCE):
         if course.recent >= (1 - LEAST_GAIN) * course.before:
             clock.converged()
             break
+        # by the used samples: the held-out ones rise and fall by more than λ changes them
         step = TIGHTER if course.fits_noise else 1 / TIGHTER
         course.hold(step * course.refinement.parameters.tv_weight)
     return course.at_best()

@@ -62,6 +62,7 @@ def solve_twist(
     shape = segment.geometry.video_shape(N_m, T_m)
     count = find_band(segment, problem, options, clock) if banded else shape[0]
     basis = TemporalBasis(shape[0], count, problem.arrays)
+    # with all cosines, the shear is less work than dense factors
     make = band_operator if banded else InBasis
     operator = make(segment.geometry, segment.code, basis, N_m, T_m, segment.alignment, segment.blur)
     parameters = TwistParameters()
@@ -100,7 +101,9 @@ class KnownImage:
         self._problem = problem = problem.on_host()
         arrays = problem.arrays
         self._image, self._merge = image.astype(arrays.dtype), options.spatial_merge
+        # no band: with the picture known, the lines determine its light up to pulses of single sub-steps
         basis = TemporalBasis(frames, frames, arrays)
+        # unit norm, whatever the image's units, so that the fit's ridge means the same
         patterns = self._image[None] / np.linalg.norm(self._image)
         self._operator = CurveOperator(segment, patterns, basis, options.temporal_merge)
         coefficients = np.zeros((frames, 1))

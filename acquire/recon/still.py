@@ -36,6 +36,7 @@ def best_still(still: Trial, trials: int, *, merge: int) -> Trial:
     best = best.bench.climb(best, trials)
     if bench.clock.spent(SEARCH_SHARE):
         return best
+    # after the climb: the residuals of a still that is not yet good are no outliers
     robust_problem = best.bench.problem.with_robust_weights(best.bench.predict(best))
     robust_bench = best.bench.with_problem(robust_problem)
     robust = robust_bench.attempt(replace(best.candidate, robust=True), NEXT_ITERATIONS, best)

@@ -54,6 +54,7 @@ class FrameTv:
         capped = (
             min(weight, LARGEST_WEIGHT) if isinstance(weight, float) else xp.minimum(weight, LARGEST_WEIGHT)
         )
+        # (K,) in the frames' dtype, whether one number was given or K
         weights = xp.zeros_like(frames[:, 0, 0]) + capped
         if self._dual is None:
             self._dual = xp.stack([xp.zeros_like(frames)] * 2, axis=1)
@@ -70,6 +71,7 @@ class FrameTv:
     def _prox_of_all(self, frames: Array, weights: Array) -> Array:
         """As the compiled loops; p is the dual's part along the rows' axis, q that along the columns'."""
         xp, scale = namespace(frames), weights[:, None, None]
+        # not 0, by which the dual step would be divided; the last line makes such frames the identity
         used = xp.maximum(scale, SMALLEST_WEIGHT)
         step = used / (8 * (xp.max(used) if self._joint else used) ** 2)
         p, q = self._dual[:, 0, ...], self._dual[:, 1, ...]

@@ -61,7 +61,7 @@ class VolumeTv:
         if self._dual is None:
             self._dual = xp.stack([xp.zeros_like(frames)] * 3)
             count = frames.shape[0]
-            # computed in float64, lest frames of float64 get cosines that are rounded to float32
+            # computed in float64, so that frames of float64 do not get cosines that are rounded to float32
             matrix = TemporalBasis(count, count, Arrays(dtype="float64")).matrix()
             self._instants = xp.asarray(matrix, dtype=frames.dtype, device=frames.device)
         volume = xp.tensordot(self._instants.T, frames, axes=1)

@@ -177,10 +177,17 @@ class Workbench:
         self._merges = (1 if fine else options.spatial_merge, options.temporal_merge)
         self.merge = options.spatial_merge if fine else 1
         self.frames, self._side, _ = segment.geometry.video_shape(*self._merges)
-        self._brightness: NDArray[Any] | None = None
+        self._brightness: NDArray[Any] | None = None  # of the next trials; a trial keeps its own
         self._bright_cosines = self.frames
         self._operators: dict[tuple[int, bool], Operator] = {}  # successive trials mostly share one
-        self._response = self._voxel_energy() / USUAL_ENERGY
+
+        # energy of the normalised lines' response to steady light in the voxel in the middle of the picture
+        constant = TemporalBasis(self.frames, 1, problem.arrays)
+        point = np.zeros((1, self._side, self._side))
+        point[0, self._side // 2, self._side // 2] = 1
+        lines = host(self._operator(constant, None).forward(problem.arrays.asarray(point)))
+        energy = float(np.square(lines / problem.norm, dtype=np.float64).sum()) or USUAL_ENERGY
+        self._response = energy / USUAL_ENERGY
 
     @property
     def record(self) -> list[dict[str, Any]]:
@@ -210,7 +217,7 @@ class Workbench:
         self._fit_brightness(
             np.broadcast_to(picture, (self.frames, *picture.shape)), None, self._bright_cosines
         )
-        if self._brightness is None or self._brightness.std() < STEADY:
+        if self._brightness is None or self._brightness.std() < STEADY:  # its mean is 1
             return None
         best = self.probe(replace(self.fitting(CALM), brightness=True), rival)
         return self.follow_brightness(best, rival, WIDER) if best.error < HOPELESS * rival else best
@@ -256,7 +263,7 @@ class Workbench:
         Changes within a frame act as noise on a video of few frames: the search starts from a larger weight,
         which it would not reach in a few trials.
         """
-        larger = max(1.0, VOLUME.coefficients / self.frames) ** 2
+        larger = max(1.0, VOLUME.coefficients / self.frames) ** 2  # +1.0 dB on average of 84 cases
         cosines = min(candidate.coefficients, self.frames)
         return replace(candidate, coefficients=cosines, weight=larger * candidate.weight)
 
@@ -387,23 +394,15 @@ class Workbench:
         )
         admm.resume(best.admm)
         last = replace(best, admm=admm)
-        self.clock.reset()
+        self.clock.reset()  # whatever the search took
         for _ in self.clock.run(LAST_ITERATIONS, "solve", video=partial(self.video, last)):
             admm.step()
-        if self.clock.ended == "done":
+        if self.clock.ended == "done":  # all that a choice needs: not a run that was cut short
             self.clock.converged()
         return Chosen(self, last)
 
     def _background(self, basis: TemporalBasis) -> Array | None:
         return None if self.background is None else resized(self.background, basis)
-
-    def _voxel_energy(self) -> float:
-        """Energy of the normalised lines' response to a voxel in the middle of the picture."""
-        still = TemporalBasis(self.frames, 1, self.problem.arrays)
-        point = np.zeros((1, self._side, self._side))
-        point[0, self._side // 2, self._side // 2] = 1
-        lines = host(self._operator(still, None).forward(self.problem.arrays.asarray(point)))
-        return float(np.square(lines / self.problem.norm, dtype=np.float64).sum()) or USUAL_ENERGY
 
     def _operator(self, basis: TemporalBasis, brightness: NDArray[Any] | None) -> Operator:
         key, segment = (basis.count, brightness is not None), self._segment
@@ -464,7 +463,7 @@ class ContinuedTrial:
 
 def _with_problem(trial: Trial, problem: Problem, heavier: float) -> Trial:
     own = trial.bench.problem
-    problem = replace(problem, known_lines=own.known_lines, robust_weight=own.robust_weight)
+    problem = replace(problem, known_lines=own.known_lines, robust_weight=own.robust_weight)  # of its bench
     operator = problem.masked(trial.operator)
     return replace(trial, admm=trial.admm.with_problem(operator, problem.used_samples, heavier))
 
@@ -493,7 +492,7 @@ def parameters(candidate: Candidate, frames: int, response: float) -> AdmmParame
     return AdmmParameters(
         tv_weight=weight,
         tv_penalty=penalty,
-        sign_penalty=0.3 * penalty,
+        sign_penalty=0.3 * penalty,  # the ratio of `AdmmParameters`
         gradient_steps=steps,
         gradient_share=0.0 if steps < STILL_STEPS else STILL_SHARE,
         preconditioned=True,

@@ -30,6 +30,7 @@ def balance_of_recording(
 
     A balance in the calibration takes precedence; a warning is given if the lines contradict it.
     """
+    # as they will be solved: what a calibration and a turn of the arms leave of a difference
     segments = [as_read(each, options) for each in _sample_segments(recording)]
     found = balance_of(segments)
     if found is None:
@@ -50,7 +51,7 @@ def balance_of_recording(
 def _sample_segments(recording: Recording) -> Iterator[Segment]:
     """Cut ranges spread over the available lines, and behind a fibre over its tiles.
 
-    Ranges that cannot be cut are skipped: whoever asks for their lines gets the error.
+    Ranges that cannot be cut are skipped: reading their lines raises the error.
     """
     first, end = recording.first_available_line, recording.first_line + recording.lines
     tiles: tuple[Tile | None, ...] = (None,) if recording.fibre is None else recording.fibre.tiles

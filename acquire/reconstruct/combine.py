@@ -104,6 +104,7 @@ def combine(
     # the first tile makes the choice for the others
     if sharing and len(tiles) > 1:
         tiles = liveliest_first(recording, request, options)
+    # a tile's sub-segments follow each other, because they are stitched in order of time
     tasks = [Task(location, each, grid, options, tile=tile) for tile in tiles for each in segments]
     budget = Budget(options.budget_s, called if began is None else began, pool.workers)
     # refused before anything is written
@@ -126,6 +127,7 @@ def combine(
             raise KeyboardInterrupt  # there is nothing to keep
         facts = describe_parts(recording, request, done, options)
         cut = len(done) < len(tasks) and not watcher.stopped
+        # sub-segments repeat each other's warnings word for word: each once, in order
         warnings = (*warnings, *(text for part in done for text in part["warnings"]))
         facts |= {"balance": balance_facts, "warnings": list(dict.fromkeys(warnings))}
         facts["choice"] = sharing_facts(done) if sharing else None
@@ -202,6 +204,7 @@ def describe_parts(
 
     def rms(key: str) -> float | None:
         known = [part["quality"][key] for part in parts if part["quality"][key] is not None]
+        # JSON has None for what is unknown of a part, such as the noise
         return float(np.sqrt(np.mean(np.square(known)))) if known else None
 
     # parts may be fewer than ranges: a stop or the budget has ended the others
@@ -248,6 +251,7 @@ def _trusted_of_all_tiles(
     begin, count = segments[0].begin, len(segments)
     if request.tiles and len(parts) < count * len(request.tiles):
         return begin, begin
+    # of a tile the longest run; of all tiles what these have in common
     by_tile = [
         _longest_trusted([(each, part["trusted"]) for each, part in zip(segments, of_tile, strict=False)])
         for of_tile in (parts[first : first + count] for first in range(0, len(parts), count))

@@ -72,6 +72,7 @@ def explain(
     found = [Worth(NOTHING, bare.prediction, bare.seconds), Worth(ALL, whole.prediction, whole.seconds)]
     for number, (name, rest) in enumerate(parts.items()):
         left = _trial(calibrated(segment, rest), merges, bandwidth)
+        # 20: predictions are amplitudes
         gain_db = 20 * math.log10(left.prediction / whole.prediction)
         found.append(Worth(name, left.prediction, left.seconds, gain_db, whole.seconds / left.seconds))
         progress(number + 3, total)

@@ -96,6 +96,7 @@ def choose(known: Sequence[Learned], budget_s: float, voxels: int, workers: int 
         return Choice(
             None, f"presets were tried on {tried} ({names}), and {FEWEST_SCENES} are needed to prefer one"
         )
+    # time grows with the voxels; sub-segments are solved side by side
     scale = voxels / nearest / max(1, workers)
     in_time = {
         preset: fmean(tried[scene].psnr_db for scene in scenes)

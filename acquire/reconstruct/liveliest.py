@@ -68,6 +68,7 @@ def liveliest(
     """
     (first, count), size = stretch, recording.geometry_for(1).size
     most = min(count, MOST_LINES * size)
+    # the middle, and no more than 4·n lines: the fit's design grows with lines × n
     begin = first + (count - most) // 2
     by_tile = [energies(read(recording.cut(begin, most, tile))) for tile in tiles]
     contrast, change = (np.array(each) for each in zip(*by_tile, strict=True))
@@ -85,6 +86,7 @@ def energies(segment: Segment) -> tuple[float, float]:
     unknowns = geometry.size + geometry.substeps - 1
     contrast, residual, noise = 0.0, 0.0, 0.0
     # (line, unknown): the code that exposed each line, sub-step by sub-step
+    # a view: windows of S steps on overlap in nearly all of their bits
     windows = np.lib.stride_tricks.sliding_window_view(segment.code, unknowns)
     design = windows[: geometry.lines * geometry.substeps : geometry.substeps].astype(np.float64)
     for arm, (lines, mask) in enumerate(zip(samples, segment.mask, strict=True)):

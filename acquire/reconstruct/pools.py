@@ -90,6 +90,7 @@ class _Shared:
     """State that the processes of a pool share; each gets it at its start."""
 
     def __init__(self) -> None:
+        # not a fork, which would copy locks that this process's threads hold
         context = multiprocessing.get_context("spawn")
         self.stop = context.Event()
         self._steps = context.Semaphore(0)  # a counter: the shared memory of a Value would outlive the pool
@@ -101,6 +102,7 @@ class _Shared:
         return self._steps.get_value() / STEPS_PER_TASK
 
     def advance(self, share: float) -> None:
+        # the remainder is kept, so that no share is lost to rounding
         steps, self._share = divmod(self._share + share * STEPS_PER_TASK, 1)
         for _ in range(int(steps)):
             self._steps.release()
@@ -163,6 +165,7 @@ def open_pool(
         return
     cores = usable_cores()
     count = min(tasks, cores if workers is None else workers)
+    # without a second process, whose start takes seconds
     if count <= 1:
         with limit_threads(idle_cores()):
             yield Here(watch)
@@ -173,7 +176,7 @@ def open_pool(
     )
     try:
         yield Processes(executor, count, shared)
-    except KeyboardInterrupt:  # nobody needs the tasks in progress any more
+    except KeyboardInterrupt:  # the tasks in progress are no longer needed
         for child in multiprocessing.active_children():
             child.kill()
         raise
@@ -221,12 +224,16 @@ def _begin_worker(shared: _Shared, threads: int) -> None:
     global _worker  # noqa: PLW0603  # the only place for the state that a worker process gets at its start
     import numba
 
+    # a terminal sends Ctrl-C to all of its processes; the parent asks this one to stop
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    # numba refuses more threads than it was started with
     numba.set_num_threads(min(threads, numba.get_num_threads()))
     limit_blas(threads)
     _worker = shared
 
 
 def _solve_in_worker(task: Task) -> Part:
+    # a function of the module, because it is sent by its name; what the processes share cannot be sent
+    # with a task
     assert _worker is not None
     return solve(task, _worker)

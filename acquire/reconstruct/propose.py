@@ -69,6 +69,7 @@ def propose(
 
     found = list(zip(stretches, _tempos(len(stretches), look, progress), strict=True))
     groups = [list(group) for _, group in groupby(found, key=lambda each: each[1].voxels)]
+    # ranges of a group that one sub-segment may hold
     most = LONGEST // LOOKED_AT
     parts = [_part(group[i : i + most]) for group in groups for i in range(0, len(group), most)]
     if tile is not None:
@@ -104,6 +105,7 @@ def _tempos(
 def _alike(one: Voxels, other: Voxels) -> bool:
     """Whether two ranges need the same voxels; stills, which differ by a line or two in length, are alike."""
     slow = max(TEMPORAL_MERGES)
+    # all longer than the longest T_m of a moving scene are stills
     lengths = {min(voxels.temporal_merge, slow + 1) for voxels in (one, other)}
     return one.spatial_merge == other.spatial_merge and len(lengths) == 1
 
@@ -115,5 +117,6 @@ def _part(found: list[tuple[Stretch, Tempo]]) -> SegmentPlan:
         substeps=found[-1][0].end - found[0][0].begin,
         spatial_merge=voxels.spatial_merge,
         temporal_merge=voxels.temporal_merge,
+        # the reason of the range that was hardest to predict
         why=max(found, key=lambda each: each[1].tried[-1][1])[1].why,
     )

@@ -133,6 +133,7 @@ def in_voxels(
     stream.geometry(1).check_merge(voxels.spatial_merge, voxels.temporal_merge)
     whole = voxels.temporal_merge >= 2 * size if whole_ends is None else whole_ends
     begin, end = selection.extent(voxels, voxels, whole=whole)
+    # of long voxels, 4·n sub-steps would be few frames
     default = max(SPANS_PER_SEGMENT * size, VOXELS_PER_SEGMENT * voxels.temporal_merge)
     stretches = tuple(split(begin, end, voxels, longest or default))
     return VideoRequest(stream, stretches, Grid.finest(stretches, size), _trusted(stream, begin, end))
@@ -158,6 +159,7 @@ def in_glimpses(selection: Selection, voxels: Voxels, count: int) -> VideoReques
     for stretch in stretches:
         first = (stretch.begin + stretch.end - voxels.temporal_merge) // 2
         seen = (first, first + voxels.temporal_merge)
+        # solved for the middle only; the frame then stands for the whole range
         glimpse = stream.sub_segment(Stretch(*seen, voxels))
         glimpses.append(replace(glimpse, begin=stretch.begin, end=stretch.end, seen=seen))
     grid = Grid.finest(stretches, stream.geometry(1).size)
@@ -203,5 +205,6 @@ def along_plan(selection: Selection, plan: ReconstructionPlan, grid: Voxels | No
 def _trusted(stream: Stream, begin: int, end: int) -> tuple[int, int]:
     """Return the part of ``begin`` to ``end`` that every row samples; empty if there is none."""
     origin, trusted = stream.substeps * stream.first_line, stream.geometry().trusted
+    # sub-steps are counted in the whole recording, those of a geometry from its own first line
     low, high = max(begin, origin + trusted.start), min(end, origin + trusted.stop)
     return (low, high) if high > low else (begin, begin)

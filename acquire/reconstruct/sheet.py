@@ -53,6 +53,7 @@ def open_sheet(
     grid = request.grid
 
     def utc_ns(first: int, stop: int) -> NDArray[np.int64]:
+        # a frame's time is its beginning
         return times.utc_ns(grid.edges(slice(first, stop))[:-1], anchor)
 
     if not request.tiles:
@@ -66,6 +67,7 @@ def open_sheet(
         ) as writer:
             yield _Strip(writer, (grid.side, grid.side), utc_ns)
         return
+    # the corners of a rectangle, since tiles are listed row by row
     first, last = request.tiles[0], request.tiles[-1]
     tiles = (last.row - first.row + 1, last.column - first.column + 1)
     with MosaicWriter(

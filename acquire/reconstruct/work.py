@@ -160,6 +160,7 @@ def solve(task: Task, watch: Watch) -> Part:
         check=options.check,
         error=options.error,
     )
+    # the rest: an early end leaves part of the iterations undone
     watch.advance(1 - done)
     substeps = lines.geometry.substeps
     doubt = _why_not_trusted(result, segment)
@@ -209,6 +210,7 @@ def _why_not_trusted(result: Reconstruction, segment: SubSegment) -> str | None:
     """Return why no frame is trusted, or None: the run was stopped, or too short to explain its lines."""
     if not result.believed:
         return "no frame of it is trusted: the lines contradict the recording's description of them"
+    # a run ended by its budget is trusted if it explains its lines; one that was stopped never is
     missed = float(np.nanmax([result.quality.misfit, result.quality.prediction]))
     if result.ended != "stopped" and (result.ended != "budget" or missed <= POOR_MISFIT):
         return None

@@ -37,6 +37,7 @@ def _timing(get: Callable[[r.Register], int]) -> Iterator[_Check]:
     limits, clocks, substeps = get(r.LIMITS), get(r.SUBSTEP_CLOCKS), r.LINE.substeps.of(get(r.LINE))
     longest = (1 << r.LIMITS.substep_max_log2.of(limits)) - 1
     yield not r.LIMITS.substep_min.of(limits) <= clocks <= longest, ErrorCode.BAD_SUBSTEP, r.SUBSTEP_CLOCKS
+    # bit S of the capability stands for S sub-steps
     possible = r.CAPABILITIES.substeps.of(get(r.CAPABILITIES))
     yield not possible >> substeps & 1, ErrorCode.BAD_SUBSTEPS, r.LINE
     # The six sub-phases of a line's transfer are divided among its S sub-steps.
@@ -70,6 +71,7 @@ def _outputs(get: Callable[[r.Register], int]) -> Iterator[_Check]:
         (r.TRIGGER_B, r.TRIGGER_B_DELAY, r.TRIGGER_B_WIDTH, ErrorCode.BAD_TRIGGER_B),
     ):
         on = bool(enable.enable.of(get(enable)))
+        # an output that is off may have any timing
         yield on and get(width) == 0, code, width
         # The next request must not come before this pulse has ended: the gateware would abandon its rest.
         yield on and get(delay) + get(width) >= distance, code, delay

@@ -36,7 +36,7 @@ from acquire.codes import code_from_attrs
 from acquire.errors import DeviceError, UsageError
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
+    from collections.abc import Callable, Iterator, Mapping
 
     from acquire.codes import Code
 
@@ -148,6 +148,16 @@ class Reading:
         return self.train is not None and self.train.stopped_after is None
 
 
+def attempts() -> Iterator[None]:
+    """Yield for every attempt to read what another process writes, until its writer must have died."""
+    # The host's own time: a clock that a test advances stands still while this waits.
+    deadline_ns, nap_s = time.monotonic_ns() + int(_TORN_S * 1e9), _WRITE_S
+    while time.monotonic_ns() < deadline_ns:
+        yield
+        time.sleep(nap_s)
+        nap_s = min(2 * nap_s, _LONGEST_WRITE_S)
+
+
 class Wire:
     """One trigger's pulses, visible to every process that was given the wire when it was spawned.
 
@@ -250,14 +260,13 @@ class Wire:
                 return reading
             wake_ns, nap_s = deadline_ns, _POLL_S
             if reading.train is not None and reading.running and reading.run == run:
+                # pulses count from 0: this is the last that is waited for
                 wake_ns, nap_s = min(wake_ns, reading.train.due_ns(pulses - 1)), _STOP_POLL_S
             self.clock.sleep(min(nap_s, max(wake_ns - now_ns, 1) * 1e-9))
 
     def _observe(self) -> tuple[int, Reading]:
         """Return a sequence number and the reading that belongs to it."""
-        # The host's own time: a clock that a test advances stands still while this waits.
-        deadline_ns, nap_s = time.monotonic_ns() + int(_TORN_S * 1e9), _WRITE_S
-        while time.monotonic_ns() < deadline_ns:
+        for _ in attempts():
             sequence = self._sequence()
             # Readers take no lock: the sequence is odd while a train is being written, and a reading is valid
             # only if the sequence is the same afterwards. The clock is read in between; otherwise a reader
@@ -266,8 +275,6 @@ class Wire:
                 train, now_ns = self._known[1], self.clock.monotonic_ns()
                 if self._sequence() == sequence == self._known[0]:
                     return sequence, Reading(train, 0 if train is None else train.issued(now_ns))
-            time.sleep(nap_s)
-            nap_s = min(2 * nap_s, _LONGEST_WRITE_S)
         raise DeviceError("the simulated trigger died while it was writing to the wire")
 
     def _sequence(self) -> int:
@@ -299,12 +306,14 @@ class Wire:
 
 
 def _encode(train: PulseTrain) -> bytes:
+    # fractions as text: as JSON's floats, pulses would not be exact
     timing = (train.run, train.start_ns, str(train.line_period_ns), str(train.speed), dict(train.code))
     limits = (train.stopped_after, train.budget)
     return json.dumps([*timing, *limits, dict(train.settled_s), train.lit_part]).encode()
 
 
 def _receive(duplicate: Any) -> Wire:
+    # not `Wire()`, which would make a page of its own
     wire = Wire.__new__(Wire)
     wire._attach(duplicate.detach(), HostClock())
     return wire

@@ -50,12 +50,14 @@ class SideBySide:
         self._delivered = 0
         first, *others = self._parts
         first.arm()
+        # from the same pulse, although one may come while the parts are armed
         for part in others:
             part.arm_like(first)
 
     def next_block(self, timeout_s: float) -> CameraBlock | None:
         """Return the next lines that every part has delivered."""
         while (blocks := self._blocks(timeout_s)) is not None:
+            # a part that lost lines has blocks that begin and end elsewhere
             first = max(block.first_line for block in blocks)
             end = min(block.first_line + len(block.flags) for block in blocks)
             self._waiting = [_from(block, end) for block in blocks]
@@ -80,6 +82,7 @@ class SideBySide:
         for column, block in zip(self._opener.first_columns, blocks, strict=True):
             skip = first_line - block.first_line
             pixels[:, column : column + block.pixels.shape[1]] = block.pixels[skip : skip + count]
+            # what is wrong with a line of one image is wrong with the sensor's line
             flags |= block.flags[skip : skip + count]
         return CameraBlock(first_line, pixels, flags)
 

@@ -102,6 +102,7 @@ class SimulatedCamera:
     ) -> None:
         self._wire, self._optics, self._config, self._block_lines = wire, optics, config, block_lines
         self._line_rate_hz = line_rate_hz
+        # the lines whose exposure began before the first pulse: M + 1
         self._depth_lines = optics.geometry.segment(1).depth_lines
         self._train: int | None = None
         self._first_pulse = 0

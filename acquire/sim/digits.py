@@ -97,7 +97,9 @@ def _digit_light(display: DisplayConfig, first: int, count: int, step: float) ->
     ``step`` is the duration of a sub-step in periods of a digit.
     """
     loop = len(display.digits)
+    # by the loop's cycles, so that whole loops are dropped and the phase stays exact (`drives`)
     begin = phase(first, count, step / loop, display.phase_deg / loop) * loop
+    # (digit, sub-step): time since each digit of the loop began, in periods
     at = begin - np.arange(loop)[:, None]
     # A sub-step may reach into the next loop, and may be longer than a whole one.
     rounds = range(int(np.ceil(step / loop)) + 1)

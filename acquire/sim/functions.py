@@ -88,9 +88,11 @@ def checked_light(light: Any, shape: tuple[int, ...], what: str) -> NDArray[np.f
 
 def load_function(name: str) -> LightFunction:
     """Import ``module:name`` or run ``file.py:name``. Raises UsageError if there is no such function."""
+    # from the right: a path may contain colons
     place, _, attribute = name.rpartition(":")
     try:
         if place.endswith(".py"):
+            # run and not imported: the file need not be on the path, nor be named like a module
             found = runpy.run_path(str(Path(place))).get(attribute)
         else:
             found = getattr(importlib.import_module(place), attribute, None)

@@ -109,6 +109,7 @@ class SimulatedDevices:
                 fibre=config.laid_out,
             )
             for arm in ARMS:
+                # under any code: scene, optics and effects are what may be refused
                 bench.camera(arm, ConstantCode(0))
             self._scene, self._scene_version = scene, version
 

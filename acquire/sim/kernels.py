@@ -24,6 +24,7 @@ def add_along_rows(
     for i in range(frames.shape[0]):
         for r in range(frames.shape[1]):
             q = newest[i] - rows[r]
+            # at its ends a range of frames also lights packets of other calls
             if 0 <= q < out.shape[0]:
                 for c in range(frames.shape[2]):
                     out[q, c] += light[i] * frames[i, r, c]
@@ -66,11 +67,14 @@ def chop(
     for i in range(frames.shape[0]):
         for r in range(frames.shape[1]):
             for c in range(frames.shape[2]):
+                # nothing to cover, and the angle takes far longer than the comparison
                 if frames[i, r, c] == 0:
                     continue
                 x = (angle[r, c] - turned[i]) * blades
                 x -= np.floor(x)
+                # distance to the nearest edge in pitches, negative on a spoke
                 inside = min(x, open_part - x) if x < open_part else -min(x - open_part, 1 - x)
+                # an arc from the nearest edge, in pixels
                 distance = inside / blades * 2 * np.pi * radius[r, c]
                 frames[i, r, c] *= min(1.0, max(0.0, 0.5 + distance))
 
@@ -95,6 +99,7 @@ def paste(
         for r in range(max(0, int(row - reach)), min(n, int(row + reach) + 2)):
             for c in range(max(0, int(column - reach)), min(n, int(column + reach) + 2)):
                 dy, dx = r + 0.5 - row, c + 0.5 - column
+                # texel k is centred at k + ½, like the pixels above
                 v = (cosine * dy + sine * dx) * scale + side / 2 - 0.5
                 u = (cosine * dx - sine * dy) * scale + side / 2 - 0.5
                 if 0 <= v < side - 1 and 0 <= u < side - 1:
@@ -119,6 +124,7 @@ def follow(target: NDArray[Any], rise: float, fall: float, level: NDArray[Any], 
     for k in range(target.shape[0]):
         for t in range(target.shape[1]):
             tau = rise if target[k, t] > level[k] else fall
+            # the target is constant within a step: this is the exact solution and its mean, at any tau
             left = np.exp(-1 / tau)
             out[k, t] = target[k, t] + (level[k] - target[k, t]) * tau * (1 - left)
             level[k] = target[k, t] + (level[k] - target[k, t]) * left

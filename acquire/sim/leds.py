@@ -77,6 +77,7 @@ class LedScene(MaskScene):
             # Only the square around the shape is computed: the rest of the mask's memory stays untouched.
             rows, columns = _extent(led.row, led.size, size), _extent(led.column, led.size, size)
             row, column = (centre[rows] - led.row) / led.size, (centre[columns] - led.column) / led.size
+            # in the shape's own unit, the side of its bounding square
             pixel = 1 / (led.size * size)
             mask[rows, columns] = coverage(led.shape, row[:, None], column[None, :], pixel=pixel)
 

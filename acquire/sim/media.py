@@ -91,6 +91,7 @@ class VideoScene:
             )
         self._frames_per_substep = (rate_hz or 0.0) * substep_s
         self._kept: OrderedDict[int, Light] = OrderedDict()
+        # a file that cannot be shown is refused when the scene is made, not in a camera's process
         self.frames(0, 1)
 
     def frames(self, first: int, count: int) -> NDArray[np.float32]:
@@ -116,6 +117,7 @@ class VideoScene:
         if index in self._kept:
             self._kept.move_to_end(index)
             return self._kept[index]
+        # before it is resampled: means are taken of light, not of grey levels
         light = np.clip(self._source.frame(index), 0, None) ** np.float32(self._config.gamma)
         self._kept[index] = resample(_square(light, self._config.fit), self.size)
         if len(self._kept) > _KEPT_FRAMES:
@@ -133,6 +135,7 @@ def open_media(path: Path) -> Source:
 
     try:
         return _PictureFile(path)
+    # the warning as well, which is raised where warnings are errors
     except (Image.DecompressionBombError, Image.DecompressionBombWarning) as error:
         raise UsageError(f"{path} cannot be read: {error}") from error
     except (OSError, SyntaxError, ValueError):
@@ -149,6 +152,7 @@ def read_picture(path: Path, side: int) -> tuple[NDArray[np.float64], NDArray[np
     except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
         raise UsageError(f"picture {path} cannot be read: {error}") from error
     alpha = resample(_square(channels[..., 1], "pad"), side)
+    # multiplied before it is averaged, so that what is transparent does not colour the edges
     light = resample(_square(channels[..., 0] * channels[..., 1], "pad"), side)
     return light.astype(np.float64), alpha.astype(np.float64)
 
@@ -322,6 +326,7 @@ class _Container:
     def frame(self, index: int) -> Light:
         import av
 
+        # the frame that was decoded last is still there; an earlier one needs a new start
         if index < self._next - 1 or self._latest is None:
             self._next, self._decoded = 0, self._decode()
         while self._next <= index:

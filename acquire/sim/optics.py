@@ -37,6 +37,7 @@ def laid_out(scene: Scene, fibre: Fibre, arm: str) -> Scene:
 
     if isinstance(scene, SeparableScene):
         return _MappedMasks(scene, image)
+    # frames of a fibre are wider than they are high; ``size`` is their height
     return _MappedFrames(scene, image, fibre.size)
 
 
@@ -55,6 +56,7 @@ def tile_view(scene: Scene, fibre: Fibre, tile: Tile) -> Scene:
 class _MappedMasks(MaskScene):
     def __init__(self, scene: SeparableScene, image: Image) -> None:
         self._scene = scene
+        # once: the map is linear and does not change with time
         self.masks = image(scene.masks)
 
     def intensity(self, first: int, count: int, substep_s: float | None = None) -> NDArray[np.float64]:
@@ -82,6 +84,7 @@ class _BinnedMasks(MaskScene):
         self.masks = _sum_pixels(scene.masks, factor) * np.float32(factor)
 
     def intensity(self, first: int, count: int, substep_s: float | None = None) -> NDArray[np.float64]:
+        # steps of a given length are counted in seconds, not in sub-steps: they are the same ones
         if substep_s is not None:
             return self._scene.intensity(first, count, substep_s)
         fine = self._scene.intensity(first * self._factor, count * self._factor)
@@ -98,6 +101,7 @@ class _BinnedFrames:
         return self.frames_at(np.arange(first, first + count))
 
     def frames_at(self, substeps: NDArray[np.int64]) -> NDArray[np.float32]:
+        # ascending, as `frames_at` demands
         fine = (substeps[:, None] * self._factor + np.arange(self._factor)).ravel()
         frames = _sum_pixels(frames_at(self._scene, fine), self._factor)
         summed: NDArray[np.float32] = frames.reshape(len(substeps), self._factor, self.size, self.size).sum(

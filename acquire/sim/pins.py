@@ -27,7 +27,7 @@ import numpy as np
 from acquire.clock import NS_PER_S
 from acquire.errors import DeviceError
 from acquire.lines import ARMS
-from acquire.sim.clock import HostClock, PulseTrain, Reading
+from acquire.sim.clock import HostClock, PulseTrain, Reading, attempts
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -35,9 +35,9 @@ if TYPE_CHECKING:
 ROOM = 1 << 23
 """Number of sub-steps whose light is kept: more than a minute."""
 _HEADER_BYTES = 4096
+# indices of 64-bit words; two are pulses, one for each arm
 _SEQUENCE, _RUN, _RUNNING, _PULSES, _SUBSTEPS, _PERIOD_CLOCKS, _CLOCK_HZ, _FIELDS = 0, 1, 2, 3, 5, 6, 7, 8
 _POLL_S = 0.001
-_TORN_S = 1.0
 _LIGHT_S = 10.0
 """Longest wait of a camera for light, which it needs some hundred lines ahead."""
 
@@ -104,13 +104,11 @@ class PinPage:
 
     def read(self) -> NDArray[np.uint64]:
         """Return the header's fields, all from one moment."""
-        deadline_s = time.monotonic() + _TORN_S
-        while time.monotonic() < deadline_s:
+        for _ in attempts():
             before = int(self._header[_SEQUENCE])
             fields = self._header.copy()
             if not before & 1 and before == int(self._header[_SEQUENCE]):
                 return fields
-            time.sleep(0)
         raise DeviceError("the gateware's process died while it was publishing its pins")
 
     @property

@@ -198,6 +198,7 @@ class Sensor(Camera):
     def _digital(self, index: int) -> NDArray[Any]:
         """Return a tile of lines as converted, before the effects on the stream."""
         first_line, light = index * TILE_LINES, self._expected(index * TILE_LINES, TILE_LINES)
+        # the responsivity is DN per unit of light, the gain DN per electron
         electrons = light.astype(np.float64) * (self._converter.responsivity_dn / self._gain)
         for stage in self._by_place["charge"]:
             electrons = stage.run(electrons, first_line)
@@ -228,6 +229,7 @@ class Merged(Camera):
         raw = self._raw.read(S * first_line, S * count)
         blocks = raw.pixels.reshape(count, S, -1, S)
         merged = blocks.sum(axis=(1, 3), dtype=np.uint32)
+        # a raw sample that is full has lost light, which its sum would not show
         white = blocks.max(axis=(1, 3)) >= self._raw_white_dn
         missing: NDArray[np.bool_] = np.any(raw.missing.reshape(count, S), axis=1)
         pixels = np.where(white, self._converter.white_dn, merged) * ~missing[:, None]
@@ -269,6 +271,7 @@ class _Image:
             begin = first % TILE_LINES
             lines = np.concatenate([self._recent[index] for index in tiles])
             lines = lines[begin : begin + self._lead + count].astype(np.float64)
+            # with a lead of less than a tile, the next lines and those before them begin in one of these
             self._recent = {index: self._recent[index] for index in tiles[-3:]}
         else:
             lines = self._arm.lines(first_line, count)
@@ -298,6 +301,7 @@ def _sensor(
         arm=name,
         seed=bench.scene.seed,
         realisation=bench.realisation,
+        # an emulated camera has M·S stages, and moves its charge once per line
         stages=geometry.stages * merge,
         substeps=geometry.substeps // merge,
         pixels=pixels,
@@ -352,6 +356,7 @@ def _image(
     light = Illumination.of(scene if factor == 1 else binned(scene, factor), code)
     for stage in common:
         light = stage.run(light) if stage.place == "light" else light
+    # after the effects, which are those of the sources: the trigger's window only shortens what they emit
     light = light.on_for(setting.lit_part[1] - setting.lit_part[0])
     for stage in own:
         scene = mapped(scene, stage.run) if stage.place == "image" else scene

@@ -90,9 +90,11 @@ class Stage:
     def texture(self, *scales: float) -> Image:
         """Return smooth noise of several scales (fractions of the picture), from 0 to 1."""
         total = sum(
+            # the wider noise is smoothed, the weaker it is: the factor makes all scales alike
             gaussian_filter(self.rng.standard_normal((self.n, self.n)), scale * self.n, mode="wrap") * scale
             for scale in scales
         )
+        # quantiles, so that single bright or dark grains do not take the contrast
         low, high = np.quantile(np.asarray(total), [0.01, 0.99])
         return np.asarray(np.clip((total - low) / (high - low), 0, 1), np.float32)
 
@@ -114,6 +116,8 @@ class Stage:
 
     @cached_property
     def ground(self) -> Image:
+        # drawn when it is first used, after a scene's own numbers: in another order they would be other
+        # scenes
         return np.asarray(0.35 + 0.65 * self.texture(0.008, 0.03, 0.1))
 
 
@@ -179,6 +183,7 @@ def text(s: Stage) -> Callable[[int, float], Image]:
 
     def frame(_t: int, tau: float) -> Image:
         whole, part = divmod(speed * n * tau, 1)
+        # between whole pixels, so that letters move smoothly
         views = [wide[:, int(whole) + k : int(whole) + k + n] for k in (0, 1)]
         return np.float32(0.05) + np.float32(0.9) * ((1 - part) * views[0] + part * views[1]).astype(
             np.float32
@@ -202,6 +207,7 @@ def flame(s: Stage) -> Callable[[int, float], Image]:
 
     def frame(_t: int, tau: float) -> Image:
         rise = [int(speed * s.n * tau) for speed in (1.2, 0.8)]
+        # the fields are three pictures high and wrap around: nothing repeats within a span
         waves = sum(np.roll(field, -step, axis=0)[: s.n] for field, step in zip(fields, rise, strict=True))
         breath = 1 + 0.15 * np.sin(2 * np.pi * 5 * tau)
         return np.asarray(0.02 + body * breath / (1 + np.exp(-1.2 * waves)), np.float32)
@@ -343,7 +349,7 @@ def expose(
     time_ns = (np.arange(geometry.lines) * round(1e9 * geometry.substeps / SUBSTEP_HZ)).astype(np.int64)
     return Segment(
         lines=pixels,
-        mask=(pixels < 4095),
+        mask=(pixels < 4095),  # saturated samples, as a recording masks them
         code=code,
         geometry=geometry,
         time_ns=time_ns,

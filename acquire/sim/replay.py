@@ -49,6 +49,7 @@ def replay_code(recording: Recording) -> Code:
     """Return the code of a run whose line 0 is the recording's first line."""
     code = code_from_attrs(recording.attrs["code"])
     index = recording.geometry_for(1).substeps * recording.first_line
+    # a register that starts in the state of that index makes the same bits from there on
     if isinstance(code, PrbsCode):
         return PrbsCode(code.degree, state_at(code.degree, code.state, index))
     if isinstance(code, ConstantCode):
@@ -187,6 +188,7 @@ class ReplayCamera:
         position = self._delivered
         self._delivered += count
         while position < self._delivered:
+            # the first pulses read out what was on the sensor before line 0
             line, left = position - self._depth_lines, self._delivered - position
             if line < 0:
                 pixels, flags = self._dark(min(-line, left))
@@ -216,6 +218,7 @@ class ReplayCamera:
             start, stop = page * _PAGE_LINES, min((page + 1) * _PAGE_LINES, self._rows)
             flags = flags_of(self._recording, self._opener.arm, start, stop)
             pixels = present_values(self._recording, self._opener.arm, "lines", start, flags)
+            # in the host's byte order, as a camera's samples; a recording has the format's
             self._page = (page, pixels.astype(self._stream.dtype.newbyteorder("=")), flags)
         _, pixels, flags = self._page
         part = slice(skip, skip + count)

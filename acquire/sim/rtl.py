@@ -88,6 +88,7 @@ class RtlTransport(SerialTransport):
         self._process = _spawn(clock_hz, pins)
         try:
             super().__init__(_first_report(self._process)["port"], baud(clock_hz))
+        # also of Ctrl-C: nothing else would end the process before its owner does
         except BaseException:
             _end(self._process)
             raise
@@ -103,6 +104,7 @@ def _spawn(clock_hz: int, pins: PinPage | None, *more: str) -> subprocess.Popen[
     inherited = []
     if pins is not None:
         options.append(f"--pins={pins.descriptor}")
+        # the page has no name: the process finds it by this number
         inherited.append(pins.descriptor)
     path = os.pathsep.join(filter(None, (str(ROOT), os.environ.get("PYTHONPATH"))))
     return subprocess.Popen(  # noqa: S603 - this interpreter and module

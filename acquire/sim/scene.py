@@ -71,6 +71,7 @@ def frames_at(scene: Scene, substeps: NDArray[np.int64]) -> NDArray[np.float32]:
     if not len(substeps):
         return np.empty((0, scene.size, scene.size), np.float32)
     first = int(substeps[0])
+    # a scene that cannot be sparse computes the frames between them as well
     return scene.frames(first, int(substeps[-1]) - first + 1)[substeps - first]
 
 
@@ -108,6 +109,8 @@ class MaskScene(ABC):
     def frames_at(self, substeps: NDArray[np.int64]) -> NDArray[np.float32]:
         """(count, row, column) float32."""
         first, last = (int(substeps[0]), int(substeps[-1])) if len(substeps) else (0, -1)
+        # of all sub-steps between the first and the last: intensities cost little, frames are made of the
+        # wanted ones
         light = self.intensity(first, last + 1 - first)[:, substeps - first].astype(np.float32)
         frames: NDArray[np.float32] = np.multiply.outer(light[0], self.masks[0])
         for mask, level in zip(self.masks[1:], light[1:], strict=True):

@@ -50,12 +50,14 @@ def _disc(row: Grid, column: Grid) -> Grid:
 
 def _triangle(row: Grid, column: Grid) -> Grid:
     """A triangle with its apex in the middle of the upper side; the lower side is its base."""
+    # the flank's normal is (−1, 2)/√5: the factor makes this a distance
     flank = (np.abs(column) - (row + 0.5) / 2) * (2 / np.sqrt(5))
     return _both(row - 0.5, flank)
 
 
 def _cross(row: Grid, column: Grid) -> Grid:
     """Both diagonals, clipped to the bounding square."""
+    # distance to the nearer diagonal
     diagonals = np.minimum(np.abs(row + column), np.abs(row - column)) / np.sqrt(2)
     return _both(diagonals - _STROKE, _box(row, column))
 

@@ -85,6 +85,7 @@ class Chopper:
         centre = (np.arange(size) + 0.5) / size
         up, right = config.row - centre[:, None], centre[None, :] - config.column
         self._angle = np.arctan2(up, right) / (2 * np.pi)
+        # in pixels, in which an edge's width is given; the angle is in turns
         self._radius = np.hypot(up, right) * size
 
     def cover(self, frames: NDArray[np.float32], substeps: NDArray[np.int64]) -> None:

@@ -93,6 +93,7 @@ class _Sprite:
         self._picture = (picture * config.level).astype(np.float32)
         self._alpha = alpha.astype(np.float32)
         covered = np.argwhere(alpha > 0) - (len(alpha) - 1) / 2
+        # a texel more, to which interpolation reaches
         self._reach_texels = float(np.hypot(*covered.T).max(initial=0)) + 1
 
     def draw(self, frames: NDArray[np.float32], substeps: NDArray[np.int64]) -> None:
@@ -104,6 +105,7 @@ class _Sprite:
     def _places(self, substeps: NDArray[np.int64]) -> Grid:
         """Return row and column in pixels, cosine and sine of the heading: (frame, 4)."""
         config = self._config
+        # in turns, counter-clockwise; rows count downwards, hence the sign of the sine below
         orbit = self._turns(substeps, config.orbit_hz, config.orbit_phase_deg)
         if config.turn_hz is None:
             # On a circle, the direction of motion is a quarter of a turn from that of the position.
@@ -171,6 +173,7 @@ def _ellipse(y: Grid, x: Grid, turn: float, centre: float, height: float, width:
 
 def _inside(distance: Grid) -> Grid:
     """Return 1 inside and 0 outside, with an edge that is smooth over two texels."""
+    # distances are in half sides, of 128 texels
     return np.clip(0.5 - distance * _TEXELS / 4, 0, 1)
 
 

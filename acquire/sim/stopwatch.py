@@ -42,6 +42,7 @@ class Stopwatch:
 
         def run(light: Illumination) -> Illumination:
             changed: Illumination = stage.run(light)
+            # a series calls those of the stages before it, whose time is theirs
             names = ("bits", "drives", "light")
             series = {name: self.timed(stage.effect, getattr(changed, name)) for name in names}
             return replace(changed, **series)

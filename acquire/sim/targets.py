@@ -89,6 +89,7 @@ def usaf_bars(groups: tuple[int, ...]) -> list[Bar]:
             bars += _element(group, element, row, left)
             row += 7.3 * bar_width_mm(group, element)
         bars += _element(group, 1, bottom, -1.0 * unit)
+        # the square of the standard's layout, which is no element
         bars.append(Bar(group, 0, bottom, -10.5 * unit, 5 * unit, 5 * unit))
         row = top
         for element in range(1, 7) if group + 1 in groups else ():
@@ -112,6 +113,7 @@ def usaf_picture(
 
 def overlap(size: int, begin: float, length: float) -> NDArray[np.float64]:
     """Return the fraction of each of ``size`` equal pixels of 0 … 1 that begin … begin + length covers."""
+    # clipped to the bar, each pixel's two edges are as far apart as they are covered
     edges = np.clip(np.arange(size + 1) / size, begin, begin + length)
     return np.diff(edges) * size
 

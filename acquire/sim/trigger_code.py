@@ -20,6 +20,7 @@ def light_attrs(get: Callable[[r.Register], int]) -> dict[str, Any]:
     lit = r.LED.enable.of(get(r.LED))
     degree = mask.bit_length()
     taps = TAPS.get(degree, ())
+    # a register with other taps makes another code, which `acquire.codes` does not know
     if lit and kind == r.Source.PRBS and mask == sum(1 << tap - 1 for tap in taps):
         state = f"{get(r.PRBS_SEED):#x}"
         return {"kind": "prbs", "degree": degree, "taps": list(taps), "state": state, "start": 0}

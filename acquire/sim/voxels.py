@@ -42,6 +42,7 @@ def truth(
         summed = np.add.reduceat(_merge_plane(frames, spatial_merge), begins, axis=0)
         # Added, because a voxel may begin in one block of frames and end in the next.
         voxels[voxel[0] : voxel[-1] + 1] += summed
+    # the last voxel may have fewer sub-steps
     voxels /= np.bincount(np.arange(count) // temporal_merge)[:, None, None]
     return voxels.astype(np.float32)
 

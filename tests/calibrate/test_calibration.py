@@ -14,6 +14,7 @@ from instruments import NOISE, dots, record, white
 
 from acquire.calibrate import Calibration, Measured, calibrated, open_calibration, save_calibration
 from acquire.calibrate.apply import check_fits
+from acquire.calibrate.calibration import Finding, TileAlignment
 from acquire.calibrate.check import check
 from acquire.calibrate.columns import dark
 from acquire.calibrate.exposure import open_exposure
@@ -78,6 +79,17 @@ def test_a_repeated_step_replaces_the_first(
     assert [path.name for path in tmp_path.iterdir()] == ["cal.zarr"]
 
 
+def test_a_steps_result_holds_the_tiles_that_it_aligned(whole: Calibration) -> None:
+    assert whole.alignment is not None
+    tiles = (TileAlignment("left", (0, 4), whole.alignment),)
+    facts = {"lines": 64, "tiles": 1, "misfit": 0.01}
+    known = replace(whole, alignment=None).with_step(
+        Finding("align", whole.instrument, facts=facts, tiles=tiles)
+    )
+    assert known.finding("align").tiles == tiles
+    assert known.finding("orientation").tiles == ()
+
+
 def test_anything_but_a_calibration_is_neither_read_nor_replaced(
     tmp_path: Path, recordings: dict[str, Path], known: Calibration
 ) -> None:
@@ -94,6 +106,9 @@ def test_anything_but_a_calibration_is_neither_read_nor_replaced(
     [
         ("instrument", {}),
         ("steps", 3),
+        ("steps", {"dark": {"made": "yesterday"}}),
+        ("steps", {"dark": {"made": "2026-01-31T12:00:00"}}),
+        ("steps", {"dark": {"made": 20260131}}),
         ("alignment", {"rows": "much"}),
         ("usable", [[True]]),
         ("usable", "x"),
@@ -204,6 +219,26 @@ def test_changes_are_reported(tmp_path: Path, recordings: dict[str, Path], whole
         found = check(open_exposure(record(tmp_path / f"{light}.zarr", scene, light)), whole)
         assert not found.holds
         assert quantity in {each.quantity for each in found.compared if not each.holds}
+
+
+def test_a_certain_small_change_does_not_hide_a_large_one(
+    monkeypatch: pytest.MonkeyPatch, recordings: dict[str, Path], whole: Calibration
+) -> None:
+    """Columns differ in their uncertainty: one that is beyond doubt need not be the one that matters."""
+    before = whole.quantities["offset_dn"]
+    value, uncertainty = before.value.copy(), np.zeros_like(before.value)
+    value[0, 3] += 0.45
+    value[1, 5] += 0.6
+    uncertainty[1, 5] = 0.1
+    exact = replace(
+        whole, quantities={**whole.quantities, "offset_dn": Measured(before.value, np.zeros_like(value))}
+    )
+    exposure = open_exposure(recordings["dark"])
+    now = Finding("dark", whole.instrument, {"offset_dn": Measured(value, uncertainty)})
+    monkeypatch.setattr("acquire.calibrate.check.dark", lambda *_, **__: now)
+    found = check(exposure, exact)
+    assert not found.holds
+    assert found.compared[0].change == pytest.approx(0.6)
 
 
 def test_a_turned_camera_is_reported(tmp_path: Path, whole: Calibration) -> None:

@@ -10,7 +10,7 @@ from instruments import ALL, COLUMNS, NOISE, columns_truth, record, white
 
 from acquire.calibrate import Calibration
 from acquire.calibrate.columns import ambient, dark, dark_edges, flat
-from acquire.calibrate.exposure import Exposure, open_exposure
+from acquire.calibrate.exposure import BLOCK_LINES, Exposure, moments, open_exposure
 from acquire.calibrate.transfer import transfer
 from acquire.errors import UsageError
 
@@ -211,3 +211,21 @@ def test_lines_without_shot_noise_are_refused(tmp_path: Path) -> None:
     exposures = [open_exposure(path) for path in paths]
     with pytest.raises(UsageError, match="no more noise in the light"):
         transfer([exposures[1]], measured(exposures[0]))
+
+
+@pytest.mark.parametrize("left", [0, 1, 2])
+def test_a_block_that_lost_nearly_all_lines_is_neither_dark_nor_a_drift(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, left: int
+) -> None:
+    """A mean of 0 counted for a single line, and a block without one was 0 DN away from the others."""
+    path = record(tmp_path / "dark.zarr", white(effects=NOISE), "dark", BLOCK_LINES + 64)
+    exposure = open_exposure(path)
+    whole = moments(open_exposure(path, lines=BLOCK_LINES))
+    blocks = list(exposure.samples())
+    blocks[1][1][:, left:] = False
+    monkeypatch.setattr(Exposure, "samples", lambda _: iter(blocks))
+    found = moments(exposure)
+    assert (found.lines == BLOCK_LINES + left).all()
+    assert found.mean == pytest.approx(whole.mean, abs=6 * np.sqrt(whole.variance.max()) / BLOCK_LINES)
+    assert found.variance == pytest.approx(whole.variance, rel=0.05)
+    assert np.median(found.drift) < 3

@@ -193,3 +193,9 @@ def test_a_check_reports_a_target_that_does_not_show_the_focus(tmp_path: Path) -
     assert any(
         "the optics' blur was not compared: the blur of the optics of arm" in doubt for doubt in found.doubts
     )
+
+
+def test_an_image_without_light_or_noise_is_refused() -> None:
+    dark = Still(np.zeros((SIZE + S - 1, STAGES)), 0.0, 0.0, np.ones(STAGES, np.bool_))
+    with pytest.raises(UsageError, match="best edge"):
+        straight_edges(dark, S, "a")

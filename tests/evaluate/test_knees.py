@@ -73,3 +73,7 @@ def test_seconds_have_two_digits_and_no_exponent():
         "120",
         "4600",
     ]
+
+
+def test_times_that_round_up_to_a_power_of_ten_have_two_digits_too():
+    assert [plain(each) for each in (0.0996, 0.996, 9.96, 99.6)] == ["0.10", "1.0", "10", "100"]

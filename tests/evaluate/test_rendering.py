@@ -54,6 +54,27 @@ def test_panels_of_other_intervals_share_the_clock(tmp_path):
     assert shown == [(i + 3) // 10 for i in range(40)]
 
 
+@pytest.mark.parametrize("suffix", [".png", ".mp4", ".html"])
+def test_tiles_that_were_not_reached_are_black_and_the_others_as_usual(tmp_path, suffix):
+    """They are NaN, which made white NaN, and with it every frame black."""
+    video = np.full((6, 12, 24), 0.5, np.float32)
+    video[:, 0, 0] = 1
+    video[:, :, 12:] = np.nan
+    write_video(tmp_path / "v.zarr", video, START + np.arange(6) * 1000, 1.0, 1000, {"trusted": [0, 0]})
+    assert render([Panel("v", open_video(tmp_path / "v.zarr"))], tmp_path / f"r{suffix}", Look(48), 6) > 0
+    if suffix == ".png":
+        with Image.open(tmp_path / "r.png") as sheet:
+            values = np.asarray(sheet.convert("L"))
+        assert set(np.unique(values[10:44, 2:44])) == {128}
+        assert set(np.unique(values[10:44, 52:92])) == {0}
+
+
+def test_a_video_of_which_nothing_was_reached_is_black(tmp_path):
+    video = np.full((3, 12, 12), np.nan, np.float32)
+    write_video(tmp_path / "v.zarr", video, START + np.arange(3) * 1000, 1.0, 1000, {"trusted": [0, 0]})
+    assert render([Panel("v", open_video(tmp_path / "v.zarr"))], tmp_path / "r.png", Look(48), 3) == 3
+
+
 def test_impossible_renderings_are_refused(tmp_path):
     one = panel(tmp_path, "a", 5, 1000)
     with pytest.raises(UsageError, match=r"\.mp4"):

@@ -20,7 +20,7 @@ from acquire.evaluate.tradeoff import Judge, Point, Run, amplitude_error, measur
 from acquire.evaluate.tradeoff_page import write_page
 from acquire.recon.segments import Voxels
 from acquire.sim.leds import LedConfig, LedSceneConfig
-from acquire.simulate import simulate
+from acquire.simulate import Study, Worth, simulate
 from acquire.store import open_recording
 
 VOXELS = Voxels(2, 1)
@@ -130,6 +130,16 @@ def test_the_front_holds_results_that_nothing_reaches_sooner():
         ("twist", 2),
     ]
     assert [row["pareto"] for row in table([slow, fast])] == [True, True, True, False]
+
+
+def test_a_study_of_lost_lines_alone_has_no_plot(run, tmp_path):
+    """They are not compared with the noise, and the plot had no point to scale its axes by."""
+    study = Study(1.0, 100.0, 2.0, 2.5, (Worth("dropped_lines", "stream", 0.0, None, 0.5),))
+    write_page([run], {}, study, tmp_path, HEADING, datetime.now(UTC))
+    document = json.loads((tmp_path / "tradeoff.json").read_text())
+    assert [each["effect"] for each in document["study"]["effects"]] == ["dropped_lines"]
+    assert not list(tmp_path.glob("effects*"))
+    assert "The simulator's effects" not in (tmp_path / "index.html").read_text(encoding="utf-8")
 
 
 def test_page_and_table_agree(judge, run, tmp_path):

@@ -159,6 +159,19 @@ def test_frames_that_are_not_trusted_are_left_out_or_named(cli: Cli, video: Path
 SUFFIXES = (".tif", ".ome.tif", ".h5", ".npz", ".mp4")
 
 
+@pytest.mark.parametrize("reached", [0, 3])
+def test_a_movie_is_black_where_no_tile_was_reached(tmp_path: Path, reached: int) -> None:
+    frames, time_ns = np.full((4, 8, 6), 2.0, np.float32), np.arange(4, dtype=np.int64)
+    frames[:, :, reached:] = np.nan
+    write_video(tmp_path / "v.zarr", frames, time_ns, 1.0, 1, {"trusted": [0, 0]})
+    export(video_content(open_video(tmp_path / "v.zarr"), "v", whole=True), tmp_path / "v.mp4")
+    with av.open(str(tmp_path / "v.mp4")) as file:
+        shown = next(file.decode(video=0)).to_ndarray(format="gray")
+    if reached:
+        assert shown[:, : shown.shape[1] // 2 - 8].mean() > 240
+    assert shown[:, shown.shape[1] // 2 + 8 :].mean() < 16
+
+
 @pytest.mark.parametrize("suffix", SUFFIXES)
 @pytest.mark.parametrize(("frames", "trusted"), [(range(3), [3, 3]), (range(18, 20), [0, 0])])
 def test_frames_of_which_none_is_trusted_are_written(

@@ -129,6 +129,26 @@ def test_resampling_takes_means_in_time_and_space():
     np.testing.assert_allclose(coarse[0], video[first : first + 2].mean(), rtol=1e-6)
 
 
+@settings(max_examples=200, deadline=None)
+@given(
+    stages=st.integers(1, 8),
+    substeps=st.integers(1, 3),
+    lines=st.integers(1, 60),
+    side=st.integers(1, 4),
+    frames_of_n=st.floats(0.1, 3),
+    longest=st.integers(1, 100),
+)
+def test_no_sub_segment_needs_lines_that_are_not_there(stages, substeps, lines, side, frames_of_n, longest):
+    """Slow voxels after the last line's first sub-step began with a line beyond it, which was refused."""
+    stream, size = Stream(stages, substeps, 7, 7 + lines), stages * substeps
+    voxels = Voxels(min(side, size), max(1, round(frames_of_n * size)))
+    begin, end = stream.extent(voxels, voxels, whole=True)
+    for each in stream.arrange(split(begin, end, voxels, longest), fade=3):
+        assert 7 <= each.first_line < each.first_line + each.lines <= 7 + lines
+        assert substeps * each.first_line <= each.begin
+        assert substeps * each.first_line + stream.geometry(each.lines).span >= each.end
+
+
 def test_a_piece_is_no_longer_than_allowed():
     parts = split(7, 4007, Voxels(3, 4), 600)
     assert parts[0].begin == 7

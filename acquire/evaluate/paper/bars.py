@@ -57,6 +57,7 @@ def _contrast(picture: NDArray[Any], bars: list[Bar], field_mm: float) -> float:
     along = [(bar.left, bar.width) if lying else (bar.top, bar.height) for bar in bars]
     across = sorted((bar.top, bar.height) if lying else (bar.left, bar.width) for bar in bars)
     begin, length = along[0]
+    # the middle half, away from the ends, at which blur mixes bars with the ground around them
     low, high = (_pixel(begin + part * length, field_mm, size) for part in (0.25, 0.75))
     middle = slice(int(low), max(int(low) + 1, int(np.ceil(high))))
     profile = view[:, middle].mean(axis=1)
@@ -72,5 +73,6 @@ def _pixel(millimetres: float, field_mm: float, size: int) -> float:
 
 def _at(profile: NDArray[Any], millimetres: float, field_mm: float) -> float:
     """Interpolate the profile between the centres of its pixels."""
+    # pixel k is centred at k + ½
     place = _pixel(millimetres, field_mm, len(profile)) - 0.5
     return float(np.interp(place, np.arange(len(profile)), profile))

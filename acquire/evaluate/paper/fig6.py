@@ -183,6 +183,7 @@ def _pulses(
     # a pixel of a coarse sensor sums the light of its fine pixels
     binned = scene.masks[0].reshape(geometry.size, factor, geometry.size, factor).sum(axis=(1, 3))
     image = binned if picture is None else picture
+    # one voxel as large as the field: only its light over time is of interest
     result = reconstruct(segment, geometry.size, 1, static_image=image)
     level = factor * binned.mean()  # a coarse step collects the light of its fine sub-steps
     light = np.where(segment.code > 0, result.video[:, 0, 0] / level, np.nan)

@@ -129,6 +129,7 @@ def _profiles(
         place = 0.5 + np.stack([-np.sin(angle) * reach, np.cos(angle) * reach])
         return map_coordinates(picture.astype(np.float64), place * len(picture) - 0.5, order=1)
 
+    # the stripes turn with their fish: where they are is taken from the truth
     angles = np.linspace(0, np.pi, 60, endpoint=False)
     angle = max(angles, key=lambda each: float(np.abs(np.diff(along(truth, each))).sum()))
     pictures = {"truth": truth, "N_m = 1": detail, "N_m = 3": motion}

@@ -119,6 +119,7 @@ class Studio:
         With ``interline`` the charge moves by whole pixels, as in the baseline of Fig. 6; with
         ``gain_dn_per_e`` the camera has shot noise and the read noise `READ_NOISE_E`.
         """
+        # figures share recordings: a name stands for everything that they differ in
         name = f"{scene_name}-interline" if interline else scene_name
         name += "" if gain_dn_per_e is None else "-noisy"
         if (self.directory / f"{name}.zarr").exists():

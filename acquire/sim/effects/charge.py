@@ -140,6 +140,7 @@ class ReadNoise(Effect):
 
     kind: Literal["read_noise"]
     place: ClassVar[Place] = "charge"
+    # after the full well: the amplifier's noise is not held in the pixel
     rank: ClassVar[float] = 70
     sigma_e: Positive = Field(description="σ_d")
 

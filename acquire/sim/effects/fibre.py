@@ -79,6 +79,7 @@ class FibreGain(Effect):
                 gain[begin:end] += column_gain
             else:
                 gain[:, begin:end] += column_gain[:, None]
+        # per pixel of the scene, each of which has a fibre of its own
         gain += self.fibres * drawn.standard_normal((side, side)).astype(np.float32)
         np.maximum(gain, 0, out=gain)
 

@@ -82,6 +82,7 @@ class PointSpread(Effect):
         sigma = self.sigma_pixels if sigma_b is None else sigma_b
 
         def run(frames: NDArray[np.float32]) -> NDArray[np.float32]:
+            # not `gaussian_filter`, which would blur along the first axis, over masks or sub-steps, too
             along = gaussian_filter1d(frames, sigma, axis=1, mode="constant")
             blurred: NDArray[np.float32] = gaussian_filter1d(along, sigma, axis=2, mode="constant")
             return blurred

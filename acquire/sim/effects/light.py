@@ -83,11 +83,14 @@ class Pwm(Effect):
 
             def drives(first: int, count: int) -> NDArray[Any]:
                 begin = int(np.floor(first * periods))
+                # relative to the block: hours into a run the fraction of a carrier period would be lost
                 edges = np.arange(first, first + count + 1) * periods - begin
                 cycles = ceil(edges[-1]) + 1
                 duty = np.rint(scene.intensity(begin, cycles, period_s) * levels) / levels
                 before = np.concatenate([np.zeros((len(duty), 1)), np.cumsum(duty, axis=1)], axis=1)
                 whole = np.floor(edges).astype(np.int64)
+                # light up to each edge: whole periods, and of the one it lies in what the duty cycle has lit
+                # by then
                 area = before[:, whole] + np.minimum(edges - whole, duty[:, whole])
                 mean: NDArray[Any] = np.diff(area, axis=1) / periods
                 return mean
@@ -126,6 +129,7 @@ class LedRiseFall(Effect):
         from acquire.sim.kernels import follow  # compiled code, which is not needed to read a scene file
 
         rise, fall = self.rise_s / setting.substep_s, self.fall_s / setting.substep_s
+        # every tile starts dark and this much earlier, so that it does not depend on the tile before
         warm_up = ceil(_SETTLED * max(rise, fall))
 
         def lagged(light: Illumination) -> Callable[[int, int], NDArray[Any]]:
@@ -161,6 +165,7 @@ class Delays(Effect):
         late = (self.light_s - camera_s - setting.settled_s) / setting.substep_s
         begin, end = (late + edge for edge in setting.lit_part)
         whole = floor(begin)
+        # of the light of a sub-step, what falls into the sub-step after the one in which it begins
         part = max(0.0, end - whole - 1) / (end - begin)
 
         def delayed(light: Illumination) -> Callable[[int, int], NDArray[Any]]:

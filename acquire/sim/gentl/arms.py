@@ -33,6 +33,7 @@ class GentlArms:
         """
         if self._bench is None:
             arms = [name for name in ARMS if self._config.cameras.arm(name).driver == DRIVER]
+            # with columns of their own, both arms are on one camera
             arms = arms[:1] if self._config.columns else arms
             self._bench = GentlBench({model_of(self._config, name): sensor(name) for name in arms})
         return HarvestersOpener(spec_of(self._config, arm, str(self._bench.cti)))

@@ -41,7 +41,8 @@ def compiler() -> str | None:
 def build() -> Path:
     """Return the producer's .cti, which is compiled if necessary.
 
-    Raises DeviceError without a compiler, PlaceError or StoreError if the cache directory cannot be written.
+    Raises DeviceError without a compiler that comes to an end, PlaceError or StoreError if the cache
+    directory cannot be written.
     """
     found = compiler()
     if found is None:
@@ -69,9 +70,15 @@ def _compile(found: str, target: Path) -> None:
         (directory / "layout.h").write_text(header())
         made = directory / target.name
         command = [found, *OPTIONS, f"-I{directory}", "-o", str(made), str(SOURCE)]
-        done = subprocess.run(  # noqa: S603 - the user's own compiler
-            command, capture_output=True, text=True, timeout=COMPILE_S, check=False
-        )
+        try:
+            done = subprocess.run(  # noqa: S603 - the user's own compiler
+                command, capture_output=True, text=True, timeout=COMPILE_S, check=False
+            )
+        except subprocess.TimeoutExpired as error:
+            raise DeviceError(
+                f"{found} did not compile the producer within {COMPILE_S:g} s",
+                hint="a machine that is less busy, or CC in the environment for another compiler",
+            ) from error
         if done.returncode:
             raise DeviceError(f"{found} failed to compile the producer: {done.stderr.strip()[-2000:]}")
         made.replace(target)

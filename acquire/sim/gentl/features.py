@@ -224,6 +224,7 @@ def _encode(feature: Feature) -> bytes:
     """Return the bytes of a feature's register."""
     value = feature.value
     if feature.kind == "text":
+        # a text ends with a zero
         return str(value).encode()[: TEXT_BYTES - 1]
     if feature.kind == "float":
         return struct.pack("<d", float(value))

@@ -77,7 +77,7 @@ REGISTERS = {
     "BufferHeight": 0x00, "StreamPayloadSize": 0x08,
 }  # fmt: skip
 """Registers that the producer itself reads or writes; the last two are the stream's."""
-FREE_REGISTERS_AT = 0x100
+FREE_REGISTERS_AT = 0x100  # above those of the producer
 
 
 def header() -> str:

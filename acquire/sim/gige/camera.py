@@ -93,6 +93,7 @@ class GigeCamera:
         self._control = [_bound(address, shared=False), _bound("255.255.255.255", shared=True)]
         self._lines = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._lines.bind((address, 0))
+        # sender, request and answer of the last command
         self._answered: tuple[Any, protocol.Request | None, bytes | None] = (None, None, None)
         self._acquiring = False
         self._frames = 0
@@ -162,6 +163,7 @@ class GigeCamera:
         significant, stored = next((used, bits) for at, used, bits in PIXEL_FORMATS.values() if at == code)
         samples = lines[:, offset : offset + width]
         excess = self._bits - significant
+        # the sensor's most significant bits, as a camera with fewer bits sends them
         samples = samples >> excess if excess > 0 else samples << -excess
         data = samples.astype("<u2" if stored == 16 else "u1").tobytes()
         transmission = self.transmission
@@ -181,6 +183,7 @@ class GigeCamera:
         self._frames += 1
 
     def _put(self, packets: Iterable[bytes]) -> None:
+        # the upper half of the register holds other fields of the standard
         port = self._registers.get(protocol.STREAM_PORT) & 0xFFFF
         host = socket.inet_ntoa(struct.pack(">I", self._registers.get(protocol.STREAM_ADDRESS)))
         for packet in packets:

@@ -35,8 +35,9 @@ _ANSWER = struct.Struct(">HHHH")
 _GVSP = struct.Struct(">HHI")
 _GVSP_EXTENDED = struct.Struct(">HHIQI")
 _EXTENDED = 0x8000_0000
-_EXTENDED_REQUEST = 0x10
+_EXTENDED_REQUEST = 0x10  # flag of a resend request whose frame id has 64 bits
 _RESENDS = 1 << 2
+# reserved, payload type, time stamp, pixel format, width, height, offsets, padding of lines and of the frame
 _LEADER = struct.Struct(">HHQIIIIIHH")
 _TRAILER = struct.Struct(">HHI")
 _IMAGE = 1
@@ -76,10 +77,12 @@ def parse_resend(request: Request) -> tuple[int, int, int]:
         first, last, number = struct.unpack(">4xIIQ", request.body[:20])
     else:
         number, first, last = struct.unpack(">III", request.body[:12])
+    # packet ids have 24 bits
     return number, first & 0xFF_FFFF, last & 0xFF_FFFF
 
 
 def answer(request: Request, body: bytes) -> bytes:
+    # an acknowledge has the number after its command's
     return _ANSWER.pack(0, request.command + 1, len(body), request.number) + body
 
 
@@ -90,6 +93,7 @@ class Registers:
         self.memory = bytearray(BOOTSTRAP_BYTES) + bytearray(space)
         for at, text in texts.items():
             self.memory[at : at + len(text)] = text.encode()
+        # in network byte order, like the standard's numbers
         self.memory[ADDRESS : ADDRESS + 4] = address
         # Version 1.0 of the standard, big-endian, one stream; time stamps of 10⁹ ticks per second are in ns.
         numbers = {0: 0x1_0000, DEVICE_MODE: 0x8000_0000, STREAM_CHANNELS: 1, HEARTBEAT_MS: 3000}
@@ -145,6 +149,7 @@ def packets(frame: Frame, packet_size: int) -> Iterator[bytes]:
     size = (_GVSP_EXTENDED if frame.extended else _GVSP).size
     step = packet_size - IP_AND_UDP_BYTES - size
     leader = (0, _IMAGE, frame.time_ns, frame.pixel_format, frame.width, frame.height, 0, 0, 0, 0)
+    # formats of packets: 1 is a leader, 3 payload, 2 a trailer
     yield _header(frame, 1, 0) + _LEADER.pack(*leader)
     count = 0
     for at in range(0, len(frame.data), step):
