@@ -269,7 +269,14 @@ def _nameless(directory: Path) -> ShardFile:
 
 def tree_bytes(path: Path) -> int:
     """Return the bytes of all files below ``path``."""
-    return sum(file.stat().st_size for _, files in _walk(path) for file in files if file.is_file())
+    size = 0
+    for _, files in _walk(path):
+        for file in files:
+            # Of a growing recording, commits rename files and retention removes some at any moment.
+            with suppress(FileNotFoundError):
+                found = file.stat()
+                size += found.st_size if stat.S_ISREG(found.st_mode) else 0
+    return size
 
 
 @contextmanager
