@@ -43,6 +43,8 @@ async def begin(
             text = f"service.begin: {error}; tried again in {config.retry_s:g} s"
             log.warning("%s", text)
             service.news.add("waiting", text, level="warning")
+        except Exception as error:  # noqa: BLE001 - otherwise nobody would learn why nothing is recorded
+            service.troubles.note("service.begin", error)
         else:
             return
         await asyncio.sleep(config.retry_s)

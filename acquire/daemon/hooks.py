@@ -6,6 +6,7 @@ is given up after a timeout, and later news are sent afterwards, as far as the l
 
 from __future__ import annotations
 
+import http.client
 import logging
 import subprocess
 import threading
@@ -99,3 +100,5 @@ class Hooks:
                 return
         except OSError as error:
             log.warning("hook %s: %s", url, error)
+        except http.client.HTTPException as error:  # the port is another service's, or that of https
+            log.warning("hook %s: the answer is not HTTP: %r", url, error)
