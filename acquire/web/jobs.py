@@ -201,11 +201,18 @@ async def _follow_progress(job: _Job) -> None:
     """Copy a job's progress reports into its facts, until it closes its standard error."""
     assert job.process is not None
     assert job.process.stderr is not None
-    with contextlib.suppress(ValueError):  # raised for a line that is too long; the rest is then ignored
-        async for line in job.process.stderr:
-            # Once it is being stopped, the text that says so stays.
-            if job.ending is None:
-                job.update(**progress_facts(line.decode(errors="replace")))
+    while True:
+        try:
+            line = await job.process.stderr.readline()
+        except ValueError:
+            # A part of a line that is too long is dropped. Reading goes on: a process whose pipe is full
+            # waits for ever, and so would its job and all that are queued behind it.
+            continue
+        if not line:
+            return
+        # Once it is being stopped, the text that says so stays.
+        if job.ending is None:
+            job.update(**progress_facts(line.decode(errors="replace")))
 
 
 async def _stop_process(job: _Job) -> None:
