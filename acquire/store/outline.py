@@ -157,6 +157,11 @@ class Outline:
         """Number of gaps for which the table had no room."""
         return int(self._nodes["gaps"]["attributes"]["not_listed"])
 
+    @cached_property
+    def events_not_listed(self) -> int:
+        """Number of events for which the table had no room."""
+        return int(self._nodes["events"]["attributes"]["not_listed"])
+
     def geometry_for(self, lines: int) -> Geometry:
         """Return the geometry of a cut of ``lines`` lines."""
         sizes = self.attrs["geometry"]

@@ -273,6 +273,7 @@ class _Recoverer:
             if kept > 0:
                 gaps.add({"first_line": first, "count": kept, "cause": cause, "arm": ARMS.index(arm)})
         gaps.not_listed += recording.gaps_not_listed
+        events.not_listed += recording.events_not_listed
         for event in recording.events:
             events.add({"tick": event.tick, "line": event.line, "kind": event.kind, "text": event.text})
         # A writer that dies between a line's commit and that of its event leaves a line without its mark.
