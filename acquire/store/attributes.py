@@ -202,6 +202,7 @@ _ROOT = _record(
 
 def segment_of(attributes: dict[str, Any]) -> tuple[str, int] | None:
     """Return the name of the recording that this segment continues, and its number; None if it is none."""
+    # Checked here: searches for segments read roots that nothing has checked as a whole.
     segment: Any = attributes.get("segment")
     try:
         _SEGMENT(segment)
@@ -212,6 +213,7 @@ def segment_of(attributes: dict[str, Any]) -> tuple[str, int] | None:
 
 def upload_target(attributes: dict[str, Any]) -> str | None:
     """Return the URL to which the rig copies its recordings, according to its configuration, or None."""
+    # Step by step: this reads roots that nothing has checked.
     found: Any = attributes
     for key in ("config", "recording", "upload_to"):
         found = found.get(key) if isinstance(found, dict) else None

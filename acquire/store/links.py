@@ -48,6 +48,7 @@ def refuse_link(root: Path, path: Path) -> None:
     """Raise DataError if ``root``, ``path`` or a directory between them is a link or a special file."""
     below = path.relative_to(root)
     for part in (*reversed(below.parents), below):
+        # What is not there yet, such as the directory of the holds, leads nowhere.
         with refused(root, "read"), suppress(FileNotFoundError, NotADirectoryError):
             mode = os.lstat(root / part).st_mode
             if (kind := kind_of(mode)) is not None and not stat.S_ISDIR(mode):

@@ -100,6 +100,7 @@ class MosaicWriter(VideoWriter):
             for array, values in zip(self._columns.values(), columns, strict=True):
                 array.resize((self.frames, *array.shape[1:]))
                 array[:] = values
+            # In whole chunks of time, each of which is read and written once.
             step = self._levels[0].chunks[0]
             for larger, smaller in zip(self._levels, self._levels[1:], strict=False):
                 smaller.resize((self.frames, *smaller.shape[1:]))

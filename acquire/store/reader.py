@@ -130,6 +130,7 @@ class Recording(Outline):
         there, and DataError if the file is damaged or the code recorded with the lines is not the one that
         the attributes describe.
         """
+        # Users know lines by number, and not in which segment an outage has put them.
         if (segment := self._segment_with(first_line)) is not None:
             return segment.cut(first_line, lines, tile)
         start, stop = self._rows(first_line, lines)
@@ -262,6 +263,8 @@ class Recording(Outline):
     ) -> NDArray[np.uint8]:
         """Return E of the segment from the attributes, after comparing it with the code stored per line."""
         S, lines = geometry.substeps, geometry.lines
+        # Computed, and only compared with what is stored: the sub-steps of the last lines reach beyond the
+        # end of the recording, and their bits are stored with no line.
         bits = code_from_attrs(self.attrs["code"]).bits(S * first_line, geometry.span)
         index = S * np.arange(first_line, first_line + lines, dtype=np.uint64)
         packed = np.packbits(bits[: S * lines].reshape(lines, S), axis=1, bitorder="little")[:, 0]

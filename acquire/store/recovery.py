@@ -269,6 +269,7 @@ class _Recoverer:
         known = [(gap.arm, gap.first_line, gap.count, gap.cause) for gap in recording.gaps]
         found = [(arm, *gap) for arm, gaps_found in new_gaps.items() for gap in gaps_found]
         for arm, first, count, cause in [*known, *found]:
+            # A gap is listed as a whole: the lines at its end may never have reached the disk.
             kept = min(count, end - first)
             if kept > 0:
                 gaps.add({"first_line": first, "count": kept, "cause": cause, "arm": ARMS.index(arm)})

@@ -168,6 +168,7 @@ class RemoteSource:
     def put(self, key: str, data: bytes) -> None:
         """Replace one part by ``data``, in one step in an object store and on a disk of this machine."""
         if self.path is not None:
+            # fsspec would write in place: after a kill, half a file would have the final name.
             put_bytes(self.path / key, data)
             return
         with _as_os_errors():

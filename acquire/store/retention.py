@@ -189,6 +189,7 @@ class Keeper:
         going = []
         age = self.policy.max_age_lines
         for shard in sorted(self.sizes):
+            # What a segment around the newest line needs is kept, even if the disk is nearly full.
             if self._lines(shard).stop > newest - self.policy.margin_lines:
                 break
             if shard in self.odd or self._held(shard, held):

@@ -52,6 +52,7 @@ class RoomWatch:
         """Return the disk's room after ``bytes_written``; queried once per `LOOK_S`. Raises OSError."""
         now = time.monotonic()
         if now >= self._due_s:
+            # Not 0 at the first query, which comes at once.
             elapsed = max(1e-3, now - self._begun_s)
             # An exponential mean, beginning with the first value.
             share = min(1.0, max(LOOK_S, elapsed) / MEMORY_S) if self._bytes else 1.0

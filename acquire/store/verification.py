@@ -177,6 +177,7 @@ def _metadata(recording: Recording) -> Iterator[str]:
         except DAMAGE as error:
             yield f"{path}/zarr.json cannot be read: {error}"
             continue
+        # Nodes in the root have no consolidated metadata of their own; the files of the groups have.
         if any(own.get(key) != value for key, value in document.items() if key != "consolidated_metadata"):
             yield f"{path}/zarr.json differs from its copy in the root"
 

@@ -98,6 +98,7 @@ class Window:
 
     def add(self, frames: NDArray[Any]) -> None:
         """Take frames into account; memory stays bounded, however many come."""
+        # Voxels of tiles that were not written are NaN (`mosaic_writer`).
         finite = frames[np.isfinite(frames)] if frames.dtype.kind == "f" else frames.reshape(-1)
         if not finite.size:
             return

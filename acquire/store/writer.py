@@ -216,7 +216,9 @@ class RecordingWriter:
         self._check_alive()
         with self._failing(f"writing lines of arm {block.arm}"):
             self._arms[block.arm].append(block, behind)
+        # After the arrays, which refuse a block that does not fit.
         self._overview[block.arm].add(block, self.spec.first_line)
+        # Of both arms, so that an arm that is ahead does not cause commits without a new row.
         written = min(arm.written_rows for arm in self._arms.values())
         if written - self._committed >= self.spec.commit_lines:
             self.commit()
@@ -273,10 +275,13 @@ class RecordingWriter:
                 self._own_due_s = time.monotonic() + OWN_INTERVAL_S
             nodes = self._publish_parts(rows, own=own)
             # The lines that retention drops are not committed any more; only then are their files deleted.
+            # A new object is a new query: a shortage is made up for once, and not again at each commit until
+            # the next.
             looked, self._looked = self._looked is not room, room
             going = self._keeper.choose(rows, -room.free_bytes if looked else 0) if self._keeper else []
             if looked:
                 self._stuck = room.full and not going
+            # Before the root, so that one that is rebuilt from the copy never claims lines that are deleted.
             if going:
                 self._publish_copy()
             self._publish_root(rows, nodes)
