@@ -32,6 +32,7 @@ async def begin(
         return
     log.info("service.begin: %s", config.begin)
     ours: str | None = None
+    # Both commands in one loop: a rig that was armed and could not record need not be armed again.
     while _is_untouched(status := service.status(), ours):
         try:
             if status.state is State.IDLE:

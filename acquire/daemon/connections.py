@@ -33,6 +33,8 @@ if TYPE_CHECKING:
 
     from starlette.types import ASGIApp
 
+# More than streams (`stream.MOST_STREAMS`) and commands (`server.MOST_WAITING`) can occupy together, which
+# leaves some for the status.
 MOST_CONNECTIONS = 32
 AT_ONCE = 16
 """Connections accepted in one turn of the event loop."""
@@ -130,6 +132,7 @@ class Connection(H11Protocol):
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
         super().connection_made(transport)
+        # From the first moment: a client that connects and sends nothing occupies a descriptor.
         self._wait(REQUEST_S)
         if len(self.connections) > self.most_connections:
             # Close the connection that has waited for longest, or this one if all others are at work.

@@ -39,6 +39,7 @@ DISK_GB = 50.0
 SPARE_MEMORY = 1.5
 """Required memory relative to that of the rings, to leave some for the rest of the capture."""
 NETWORK_DISKS = ("nfs", "nfs4", "cifs", "smb3", "fuse.sshfs", "9p", "ceph")
+# TIME_ERROR and STA_UNSYNC of the kernel's timex.h.
 _TIME_ERROR = 5
 _STA_UNSYNC = 0x40
 
@@ -79,6 +80,7 @@ def examine(rig: RigConfig | None, running: str | None) -> Iterator[Finding]:
 def _foreign_package() -> Finding:
     """Find other distributions with a package `acquire`, of which PyPI has one: they break each other."""
     owners = set(metadata.packages_distributions().get("acquire", ()))
+    # PyPI's acquire-imaging is one.
     others = sorted(owners - {"tdi-acquire"})
     if not others:
         return Finding("package", "good", "no other distribution installs a package `acquire`")

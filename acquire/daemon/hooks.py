@@ -63,6 +63,7 @@ class Hooks:
             found = self._news.after(self._last_id)
             self._last_id = found[-1].id if found else self._last_id
             for news in [one for one in found if self._concerns(one)][-MOST_AT_ONCE:]:
+                # Whoever gets the messages of several rigs must see whose it is.
                 named = news.model_copy(update={"text": f"{self._rig}: {news.text}"})
                 text = named.model_dump_json().encode()
                 if self._config.command:

@@ -87,6 +87,7 @@ class StartRequest(Message):
         description="absolute path of the new recording; absent: named after rig and time in the "
         "configured directory",
     )
+    # Up to 2**53: browsers do not keep larger integers exactly.
     lines: int | None = Field(
         default=None, strict=True, ge=1, le=2**53, description="line budget; absent: until stop"
     )
@@ -366,6 +367,7 @@ class ErrorMessage(Message):
 
     def rebuild(self) -> AcquireError:
         """Return the error, of its original class if this version knows it."""
+        # The name comes from the other side of the socket: anything but an error of ours is not used.
         known = getattr(errors, self.error, None)
         if not (isinstance(known, type) and issubclass(known, AcquireError)):
             known = AcquireError

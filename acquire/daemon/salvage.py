@@ -149,6 +149,7 @@ class Salvage:
         except OSError as error:
             log.warning("%s cannot be searched for open recordings: %s", self._directory, error.strerror)
             return
+        # A directory of thousands of other things must neither fill the log nor push the recordings out.
         for one in found.odd[:MOST_ODD]:
             log.warning("%s %s: %s", one.path, one.state, one.text)
             if one.path not in self._found:
@@ -158,6 +159,7 @@ class Salvage:
         for path in found.open:
             if path not in self._found:
                 self._queue(Task(path))
+        # What the journal names and the search met neither open nor odd is sealed by now.
         met = {*found.open, *(one.path for one in found.odd)}
         for path in [path for path in self._not_sealed if path not in met]:
             self.ended(path)
