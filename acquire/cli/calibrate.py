@@ -325,6 +325,7 @@ def _exposure(
     from acquire.store import open_recording
 
     if begin is not None or end is not None:
+        # Numbers are left to `open_exposure`, which knows what a calibration needs.
         first_line, lines = lines_between(open_recording(recording), first_line, lines, begin, end)
     return open_exposure(recording, first_line, lines)
 
@@ -341,6 +342,7 @@ def _known_or_new(place: str, recording: str) -> Calibration:
     from acquire.calibrate.exposure import instrument_of
     from acquire.store import open_recording
 
+    # These steps need no earlier ones, and may be a calibration's first.
     if _exists(place):
         return _known(place)
     return Calibration(instrument_of(open_recording(recording)))
@@ -357,6 +359,7 @@ def _keep(place: str, found: Finding, *, json: bool, new: bool = False) -> None:
     from acquire.calibrate import Calibration, save_calibration
 
     known = Calibration(found.instrument) if new and not _exists(place) else _known(place)
+    # Shown all the same: the figures say by how little the views differ. Saved, it would count as known.
     if found.step == "orientation" and found.orientation is None:
         _print_finding(found, None, json=json)
         raise UsageError(

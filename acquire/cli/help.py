@@ -55,6 +55,7 @@ def _rows(rows: Any) -> Iterator[str]:
 
 def make_plain(command: Any) -> None:
     """Make a command and its subcommands print their help as plain text, as wide as the terminal."""
+    # rich takes most of a help's time, and its tables do not fit a narrow terminal.
     command.rich_markup_mode = None
     command.context_settings["max_content_width"] = columns()
     for name in ("help", "short_help", "epilog"):

@@ -266,6 +266,7 @@ def _instrument(
             substeps=known.substeps if substeps is None else substeps,
             code=light or known.code,
         )
+        # Another line rate or number of sub-steps needs other ticks than the rig's.
         if line_rate is not None or found.substeps != known.substeps:
             rate_hz = known.line_rate_hz if line_rate is None else line_rate
             # Before `clock_of`, which would never end for a rate of 0.

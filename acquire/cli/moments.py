@@ -29,6 +29,7 @@ def utc_ns(text: str) -> int | None:
         return None
     if moment is None:
         return None  # 20260131 is a number of seconds, like every bare number
+    # In whole numbers: a float of seconds since 1970 is exact to 0.2 us only.
     since = (moment if moment.tzinfo else moment.replace(tzinfo=UTC)) - datetime.fromtimestamp(0, UTC)
     return (since.days * 86_400 + since.seconds) * UNITS_NS["s"] + since.microseconds * UNITS_NS["us"]
 

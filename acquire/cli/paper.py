@@ -71,6 +71,7 @@ def paper(
     if wrong := [name for name in chosen if name not in NAMES]:
         raise UsageError(f"there is no figure {wrong[0]!r}", possible=", ".join(NAMES))
     if recording is not None:
+        # The other figures show scenes of their own, of which a recording has none.
         if figures not in (None, [], ["fig9"]):
             raise UsageError(f"{', '.join(figures)} cannot be made from a recording", possible="fig9")
         chosen = ["fig9"]

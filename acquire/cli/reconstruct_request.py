@@ -104,6 +104,7 @@ def prepare(recording: Recording, arguments: Arguments) -> Prepared:
         choice = Choice(None, "")
     else:
         grids = [request.grid for request in requests.values()]
+        # The whole work has to fit the limit: all videos, and all tiles of each.
         tiles = max(1, *(len(request.tiles) for request in requests.values()))
         choice = choose(known, options.budget_s, tiles * sum(grid.frames * grid.side**2 for grid in grids))
     options = replace(options, preset=choice.preset or options.preset)  # type: ignore[arg-type]  # checked when it is used
@@ -137,6 +138,7 @@ def check_arguments(arguments: Arguments, *, explain: bool = False) -> None:
             "iterations",
             possible="a part of the lines with coarse voxels: --from, --to and --voxels 6x4 --preset fast",
         )
+    # A preview has no plan, only coarse voxels.
     planned = bool(chosen) and not arguments.preview
     if arguments.save_plan is not None:
         if not planned:

@@ -134,6 +134,7 @@ def _download(source: Any, path: Path) -> Path:
 
     with refused(source, "read"):
         sizes = source.sizes()
+    # Refused before the download, and not by a full disk in the middle of it.
     room, size = shutil.disk_usage(path.parent).free, sum(sizes.values())
     if size > room:
         raise UsageError(

@@ -60,6 +60,7 @@ def run(words: Sequence[str]) -> int:
         from acquire.cli.completion import complete, words_so_far
 
         before = [word for word in words_so_far() if not word.startswith("-")][:1]
+        # Importing all commands for every Tab would be felt.
         modules = {BY_NAME[word].module for word in before if word in BY_NAME} or MODULES
         return complete(command_of(modules))
     first = words[0] if words else ""
@@ -78,6 +79,7 @@ def run(words: Sequence[str]) -> int:
         raise UsageError(
             f"{what}{did_you_mean(first, known)}", possible=", ".join(sorted(known)), hint="acquire --help"
         )
+    # This module alone: a command need not wait for the imports of all others.
     command = command_of([BY_NAME[first].module])
     try:
         code = command(args=list(words), prog_name="acquire", standalone_mode=False)

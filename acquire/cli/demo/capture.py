@@ -58,6 +58,7 @@ def record(plan: DemoPlan, journal: Journal) -> Captured:
                 client.start(path, lines=plan.lines)
                 with stage_progress("recording") as advance:
                     status = follow(client, plan.lines, advance)
+                # The report compares with the truth: lines that are missing would be blamed on the solvers.
                 if status.last is None or status.last.condition != "GOOD":
                     reason = status.fault or (
                         status.last and f"{status.last.condition}: {status.last.end_reason}"
