@@ -67,7 +67,7 @@ def complete(command: Any) -> int:
     _without_help(command)
     try:
         command(args=[], prog_name=PROGRAM, complete_var=VARIABLE)
-    # typer exits by itself, as if the process were its own.
+    # typer exits the process itself.
     except SystemExit as ended:
         return ended.code if isinstance(ended.code, int) else 1
     return 0

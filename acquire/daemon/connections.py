@@ -49,7 +49,7 @@ IDLE_S = 5
 GRACE_S = 2
 """Time for current requests when the daemon ends, in whole seconds."""
 LAST_S = 0.7
-"""Time for open connections when the server ends: a stream never ends by itself, and half a request may stay
+"""Time for open connections when the server ends: a stream has no end of its own, and half a request may stay
 incomplete. If uvicorn cancelled them after `GRACE_S`, they would be answered with 500."""
 MOST_DESCRIPTORS = 65536
 
@@ -148,7 +148,7 @@ class Connection(H11Protocol):
         super().data_received(data)
         if self.is_working:
             self._cancel()
-        elif self._timer is None:  # a running timer is not prolonged by a byte now and then
+        elif self._timer is None:  # a running timer is not prolonged by single bytes
             self._wait(REQUEST_S)
 
     def on_response_complete(self) -> None:

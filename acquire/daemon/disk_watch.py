@@ -37,7 +37,7 @@ def disk_watch(config: RigConfig) -> DiskWatch:
 
 
 class DiskWatch:
-    """Queries the directory's disk now and then; `check` never waits.
+    """Queries the directory's disk from time to time; `check` never waits.
 
     Parameters
     ----------

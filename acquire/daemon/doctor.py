@@ -111,7 +111,7 @@ def _descriptors() -> Finding:
     return Finding(
         "descriptors",
         "warning",
-        f"a process may have {hard} only",
+        f"a process may have only {hard}",
         "LimitNOFILE=65536 in the unit, or nofile in /etc/security/limits.d/",
     )
 
@@ -156,10 +156,10 @@ def _realtime(rig: RigConfig | None) -> Finding:
 def _memory(rig: RigConfig | None) -> Finding:
     there = available_bytes()
     if rig is None:
-        return Finding("memory", "good", f"{there / 1e9:.1f} GB can be had")
+        return Finding("memory", "good", f"{there / 1e9:.1f} GB are available")
     line_bytes = rig.pixels * np.dtype(rig.cameras.a.dtype).itemsize
     rings = len(ARMS) * rig.ring_slots * rig.stream.block_lines * line_bytes
-    text = f"{there / 1e9:.1f} GB can be had, the rings take {rings / 1e9:.2f} GB"
+    text = f"{there / 1e9:.1f} GB are available, and the rings need {rings / 1e9:.2f} GB"
     if there > SPARE_MEMORY * rings:
         return Finding("memory", "good", text)
     return Finding("memory", "bad", text, "a smaller stream.ring_seconds, or end other programs")
@@ -168,7 +168,7 @@ def _memory(rig: RigConfig | None) -> Finding:
 def _disk(directory: Path) -> Iterator[Finding]:
     path = directory.absolute()
     if not path.is_dir():
-        yield Finding("disk", "bad", f"{path} is no directory", f"mkdir -p {path}, or recording.directory")
+        yield Finding("disk", "bad", f"{path} is not a directory", f"mkdir -p {path}, or recording.directory")
         return
     if not os.access(path, os.W_OK | os.X_OK):
         yield Finding("disk", "bad", f"{path} is not writable for this user", f"chown or chmod {path}")
@@ -218,7 +218,7 @@ def _clock() -> Finding:
     # With `modes` = 0 the call changes nothing, and needs no rights.
     state = ctypes.CDLL(None).adjtimex(ctypes.byref(timex))
     if state < 0:
-        return Finding("clock", "warning", "the kernel does not say whether the clock is set by others")
+        return Finding("clock", "warning", "the kernel does not report whether the clock is synchronised")
     if state == _TIME_ERROR or timex.status & _STA_UNSYNC:
         return Finding(
             "clock",

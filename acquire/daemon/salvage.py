@@ -8,8 +8,8 @@
 
 A recording that another process still writes, as the lock of its directory shows, is left to it. Others are
 reported once, in the status and in the log, and not touched: those written by another machine, on a file
-system without locks, or with links, and anything that is no recording. The process ends at once when a run is
-armed, unless it recovers a recording of that run; an interrupted recovery is repeated afterwards.
+system without locks, or with links, and anything that is not a recording. The process ends at once when a
+run is armed, unless it recovers a recording of that run; an interrupted recovery is repeated afterwards.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ MOST_TRIES = 6
 MOST_LISTED = 32
 """Number of latest recordings in the status: more than one run can leave."""
 MOST_ODD = 8
-"""Number of entries of the directory in the status that are no recordings."""
+"""Number of entries of the directory in the status that are not recordings."""
 _END_S = 5.0
 _POLL_S = 0.02
 

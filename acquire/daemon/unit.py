@@ -104,7 +104,7 @@ def _hardening(recordings: Path, rig: RigConfig) -> list[str]:
     """Return settings that deny everything unneeded. (Not MemoryDenyWriteExecute: the simulator compiles.)"""
     writable = {recordings, rig.control.socket.absolute().parent}
     return [
-        "# Where the host's memory ends, others are killed before the capture is; only root may ask for it.",
+        "# If memory runs out, other processes are killed before the capture. Only root may set this.",
         "OOMScoreAdjust=-500",
         "NoNewPrivileges=yes",
         "UMask=0077",

@@ -254,7 +254,7 @@ class Uploads:
         self._deaths += 1
         self._not_before_s = time.monotonic() + later_s
         self.warning = f"the uploading process: {why}"
-        log.error("%s; another takes its place in %g s", self.warning, later_s)
+        log.error("%s; it is replaced in %g s", self.warning, later_s)
 
     def _query(self) -> Reached | None:
         """Return the store's answer, or None if there is none in time."""

@@ -201,7 +201,7 @@ _ROOT = _record(
 
 
 def segment_of(attributes: dict[str, Any]) -> tuple[str, int] | None:
-    """Return the name of the recording that this segment continues, and its number; None if it is none."""
+    """Return the name of the recording that this segment continues, and its number; None if it is not one."""
     # Checked here: searches for segments read roots that nothing has checked as a whole.
     segment: Any = attributes.get("segment")
     try:

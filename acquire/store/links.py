@@ -23,8 +23,8 @@ if TYPE_CHECKING:
 def refuse_links(root: Path) -> None:
     """Raise DataError unless ``root`` and everything below it are directories and regular files.
 
-    A directory without any part of a recording passes: opening it reports that it is none. Raises the error
-    of `refusals.refusal` if the entries cannot be read.
+    A directory without any part of a recording passes: opening it reports that it is not a recording. Raises
+    the error of `refusals.refusal` if the entries cannot be read.
     """
     refuse_link(root, root)
     if not any(os.path.lexists(root / part) for part in ("zarr.json", *ARMS)):

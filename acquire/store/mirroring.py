@@ -91,7 +91,7 @@ def mirror(
     has not grown for ``idle_s``: its writer is gone.
     """
     refuse_link(path, path)
-    open_recording(path)  # raises if it is no recording
+    open_recording(path)  # raises if it is not a recording
     with only_copy(path):
         copying = _Steps(Mirror(path, url), progress)
         done = copying.step()
@@ -298,7 +298,7 @@ class Mirror:
         # A root that cannot be read, beside parts of a recording, was torn by a kill on a store that writes
         # in place: the copy is not published yet. Alone, it is somebody else's file.
         if found is None and (foreign or (root and len(self._there) == 1)):
-            what = "something damaged" if root else "something that is no recording"
+            what = "something damaged" if root else "something other than a recording"
             raise UsageError(f"{self.target} holds {what}", hint=_ELSEWHERE)
         if found is not None:
             self._root = root

@@ -33,7 +33,7 @@ def opened(source: Source, kind: type[Kind]) -> Kind:
     Raises PlaceError if there is no recording, DataError if it is damaged, and StoreError if that cannot be
     found out.
     """
-    # The format comes first: something that is no recording is a wrong path, not damage.
+    # The format comes first: something other than a recording is a wrong path, and not damage.
     document = read_root(source)
     _check_format(source, _format(document))
     try:

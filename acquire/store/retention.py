@@ -124,7 +124,7 @@ def holds_of(path: Path) -> list[Hold]:
         except FileNotFoundError:
             continue  # replaced by a wider one, or released, in the meantime
         except (*PARSE_ERRORS, OSError) as error:
-            found.append(Hold(0, ALL_LINES, f"{file.name} is no hold, remove it: {error}"))
+            found.append(Hold(0, ALL_LINES, f"{file.name} is not a valid hold, remove it: {error}"))
     return found
 
 

@@ -37,7 +37,7 @@ class Room:
 
 
 class RoomWatch:
-    """Queries the disk of ``path`` now and then; ``reserve_bytes`` of it are to stay free."""
+    """Queries the disk of ``path`` from time to time; ``reserve_bytes`` of it are to stay free."""
 
     def __init__(self, disk: Disk, path: Path, reserve_bytes: int) -> None:
         self._disk = disk

@@ -1,7 +1,7 @@
 """Recorded lines that are not on disk, found by lengths alone: in a moment, however long a recording is.
 
 `verify` reads every byte. Here only the indices of the files are read and compared with the files' sizes: a
-file that is gone or cut short is detected, a flipped bit is not. Lines flagged as missing are no shortfall:
+file that is gone or cut short is detected, a flipped bit is not. Lines flagged as missing do not count:
 their loss is recorded already.
 """
 

@@ -38,7 +38,7 @@ class Verification:
     bytes : its size
     damage : lines that are not intact on disk
     contradictions : redundant facts that disagree, in words
-    notes : remarks that are no damage
+    notes : remarks that do not report damage
     """
 
     path: str
@@ -78,7 +78,7 @@ def verify(place: Path | str, progress: Callable[[int, int], None] | None = None
         refuse_links(source.path)
     recording = open_source(source)
     scans = scan(recording, recording.kept_rows(), progress)
-    gone = open_source(source).dropped  # lines that retention deleted during the scan are no damage
+    gone = open_source(source).dropped  # lines that retention deleted during the scan are not damaged
     damage = tuple(
         found
         for arm in scans.values()

@@ -40,8 +40,8 @@ QUALITY_ATTRIBUTES: dict[str, Any] = {
 
 ERROR_ATTRIBUTES: dict[str, Any] = {
     "long_name": "estimated RMS error of the voxels of a region of the frame",
-    "comment": "in the unit of the video; NaN where it cannot be told; rows and columns in equal parts; "
-    "provenance, error, says how sure it is; frames that are not trusted are worse than it says",
+    "comment": "in the unit of the video; NaN if no estimate is possible; the regions divide rows and "
+    "columns equally; its uncertainty is in provenance.error; untrusted frames have a larger error",
 }
 
 TRUSTED_ATTRIBUTES: dict[str, Any] = {
