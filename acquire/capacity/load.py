@@ -92,6 +92,7 @@ class Load:
 
 def tag_every_lines(load: Load) -> int:
     """Return the lines per tag: at least one tag per block, and four per ring."""
+    # Within the limit of a rig, which is a third of the ring (`RigConfig`).
     return min(load.block_lines, load.ring_slots * load.block_lines // 4)
 
 
