@@ -21,6 +21,7 @@ def _on_the_wire(text: object) -> str:
     return visible(text, lines=True)
 
 
+# On the wire only: in this process a text stays what it was.
 Text = Annotated[str, PlainSerializer(_on_the_wire, return_type=str, when_used="json")]
 """Text that is made readable and harmless in JSON, such as a file name that is not UTF-8."""
 Place = Annotated[Path, PlainSerializer(_on_the_wire, return_type=str, when_used="json")]
@@ -138,6 +139,8 @@ class StartRequest(Message):
     @classmethod
     def _can_be_a_name(cls, path: Path | None) -> Path | None:
         text = str(path)
+        # A surrogate stands for a byte of a name that is not UTF-8, and could not be written to a log or an
+        # answer.
         if "\0" in text or text != text.encode(errors="replace").decode():
             raise ValueError(f"path {text!r} is not UTF-8, or has a NUL")
         if path is not None and len(path.name.encode()) > LONGEST_NAME:

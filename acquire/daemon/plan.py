@@ -62,6 +62,7 @@ class Run:
         configured = self._config.recording.codec
         if configured != "auto":
             return configured
+        # Before `arm` there is none, and nothing that it could pack.
         return self._choice.codec if self._choice else "none"
 
     def arm(self, progress: Callable[[str], object] = lambda _: None) -> None:

@@ -44,6 +44,7 @@ STREAM: dict[int | str, dict[str, Any]] = {
 TEXT: dict[int | str, dict[str, Any]] = {
     200: {"description": "Prometheus text format", "content": {"text/plain": {"schema": {"type": "string"}}}}
 }
+# An answer that a proxy has kept would show an old state as the current one.
 NO_STORE = {"Cache-Control": "no-store"}
 
 

@@ -64,6 +64,7 @@ def unit_text(rig: RigConfig, config: Path, *, user: bool, account: str | None =
         f"ExecStart={command}",
         f"ExecReload={python} -m acquire reload{_socket(rig)}",
         *([] if user else [f"User={who}", *_groups(), "RuntimeDirectory=acquire"]),
+        # The directory of `SOCKET`, which is then the default socket of the daemon.
         *([] if user else ["RuntimeDirectoryMode=0700", "Environment=XDG_RUNTIME_DIR=/run/acquire"]),
         f"WorkingDirectory={_quoted(recordings)}",
         f"WatchdogSec={WATCHDOG_S}",

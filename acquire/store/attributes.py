@@ -175,6 +175,7 @@ _ROOT = _record(
         "end_reason": _maybe(_text),
         "layout": _text,
         "first_line": _COUNT,
+        # S is limited by the code of a line, which is one byte.
         "geometry": _record(
             {"stages": _SIZE, "substeps": _whole(1, 8), "pixels": _SIZE}, {"fibre": _maybe(_FIBRE)}
         ),

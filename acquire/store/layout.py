@@ -160,6 +160,7 @@ def line_array(column: Column, shape: ArrayShape, rows: int) -> Document:
         "chunk_shape": list(shape.chunk_shape),
         "codecs": [BYTES, *packing(shape), CRC32C],
         "index_codecs": [BYTES, CRC32C],
+        # Where it can be replaced in place while the file grows.
         "index_location": "start",
     }
     return array_document(

@@ -123,6 +123,7 @@ def _check_complete(recording: Outline) -> None:
     code_from_attrs(recording.attrs["code"])
     recording.geometry_for(1)
     for path, node in recording.document["consolidated_metadata"]["metadata"].items():
+        # Files are found by these paths, which must not lead out of the recording.
         if not all(part and part not in (".", "..") and "\0" not in part for part in path.split("/")):
             raise ValueError(f"{path!r} is not the path of an array or a group")
         _check_object(node["attributes"])

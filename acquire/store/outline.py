@@ -80,6 +80,7 @@ class Outline:
     @property
     def lines(self) -> int:
         """Rows of each arm."""
+        # They differ only if the metadata are damaged: then no row counts that an arm lacks.
         return min(len(stream) for stream in self.arms.values())
 
     @property

@@ -136,6 +136,7 @@ class Recording(Outline):
         start, stop = self._rows(first_line, lines)
         geometry, columns = self.geometry_for(lines), self._columns(tile)
         stretches = self._fetched(start, stop)
+        # Read into their final place, without a copy of all of them.
         samples = np.empty((len(ARMS), lines, geometry.stages), self.arms["a"].dtype)
         for arm, of_arm, those in zip(stretches.values(), samples, columns, strict=True):
             arm["lines"].read(out=of_arm, columns=those)

@@ -36,6 +36,7 @@ _STATUS_ERRORS: dict[str, type[OSError]] = {
     "404": FileNotFoundError,
 }
 
+# A metadata service counts only if it is named.
 WAYS_IN = {
     "s3": (
         ("AWS_ACCESS_KEY_ID", "AWS_SECRET_ACCESS_KEY"),

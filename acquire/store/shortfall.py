@@ -43,6 +43,7 @@ class Damage:
 
 def shortfalls(recording: Outline, shards: range | None = None) -> Iterator[Damage]:
     """Yield the shortfalls of a recording, or of some shards. Raises DataError if gaps cannot be read."""
+    # Opened with its lines at most once, and only if a file is gone.
     whole = cache(partial(_with_lines, recording))
     for arm, files in recording.arms.items():
         lost = sorted(recording.lost_rows(arm), key=lambda rows: rows.start)

@@ -102,6 +102,7 @@ def _contradictions(recording: Recording, scans: dict[str, ArmScan]) -> Iterator
     try:
         listed = {arm: _listed(recording, arm) for arm in ARMS}
         complete = recording.gaps_not_listed == 0
+        # The tables are read here once, so that a damaged one is a contradiction and no failure of `verify`.
         recording.events  # noqa: B018 - reads the table
     except DataError as error:
         yield error.message
