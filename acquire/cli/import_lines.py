@@ -189,7 +189,7 @@ def _levels(known: Mapping[str, float], options: Mapping[str, float | None]) -> 
 def _columns(text: str | None) -> tuple[int, int] | None:
     if text is None:
         return None
-    found = re.fullmatch(r"(\d+):(\d+)", text)
+    found = re.fullmatch(r"(\d{1,9}):(\d{1,9})", text)
     if found is None:
         raise UsageError(f"columns {text!r} cannot be read", possible="FIRST:END, such as 0:192")
     return int(found[1]), int(found[2])

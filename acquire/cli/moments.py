@@ -12,7 +12,8 @@ from acquire.errors import UsageError
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-_LINE = re.compile(r"\s*[Ll](\d+)\s*")
+# Python refuses to convert thousands of digits, and a float those of more than 308.
+_LINE = re.compile(r"\s*[Ll](\d{1,18})\s*")
 
 
 def line_number(text: str) -> int | None:

@@ -177,7 +177,7 @@ def _requests(recording: Recording, arguments: Arguments) -> Prepared:
 
 def parse_voxels(text: str) -> Voxels:
     """Parse a voxel size: ``3x4`` is N_m = 3, T_m = 4."""
-    found = re.fullmatch(r"(\d+)[x×](\d+)", text)
+    found = re.fullmatch(r"(\d{1,18})[x×](\d{1,18})", text)
     if found is None:
         raise UsageError(f"the voxel size {text!r} cannot be read", possible="NMxTM, such as 3x1 or 1x820")
     return Voxels(int(found[1]), int(found[2]))
@@ -192,7 +192,7 @@ def parse_segment(text: str) -> dict[str, float]:
         "spatial_merge": voxels.spatial_merge,
         "temporal_merge": voxels.temporal_merge,
     }
-    if length.isdigit():
+    if re.fullmatch(r"\d{1,18}", length):  # not isdigit: to Python, ² is a digit and no number
         table["lines"] = int(length)
     elif length:
         table["seconds"] = parse_duration_ns(length) * 1e-9
