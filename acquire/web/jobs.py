@@ -25,6 +25,7 @@ from acquire.errors import AcquireError, PlaceError, StateError
 from acquire.web.calibrations import step_of
 from acquire.web.job_words import calibration_words, free_name, progress_facts, recording_words
 from acquire.web.messages import CalibrationRequest, JobFacts, JobRequest
+from acquire.web.worker import OWNER
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -168,7 +169,8 @@ class Jobs:
             "acquire.web.worker",
             *words,
             cwd=self._directory,
-            env=os.environ | {"ACQUIRE_SOCKET": str(self._socket), "ACQUIRE_BY": job.by},
+            env=os.environ
+            | {"ACQUIRE_SOCKET": str(self._socket), "ACQUIRE_BY": job.by, OWNER: str(os.getpid())},
             stdin=asyncio.subprocess.DEVNULL,
             stdout=asyncio.subprocess.DEVNULL,
             stderr=asyncio.subprocess.PIPE,

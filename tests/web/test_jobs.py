@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import os
+import subprocess
 import sys
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from acquire.web import glimpser, jobs
+from acquire.web import glimpser, jobs, worker
 from acquire.web.messages import JobFacts, JobRequest
 
 LONG = """
@@ -38,6 +40,15 @@ def test_a_job_that_prints_an_endless_line_ends_and_is_followed() -> None:
             await job.process.wait()
 
     assert asyncio.run(follow()) == (0, "afterwards")
+
+
+def test_a_job_whose_page_died_while_it_was_started_does_not_begin(tmp_path: Path) -> None:
+    """The kernel's signal at the page's death is only sent to those who have asked for it by then."""
+    words = [sys.executable, "-m", "acquire.web.worker", "plugins", "--json"]
+    for owner, begins in ((os.getpid(), True), (1, False)):
+        environment = os.environ | {worker.OWNER: str(owner)}
+        done = subprocess.run(words, env=environment, capture_output=True, check=True, timeout=300)
+        assert bool(done.stdout) is begins
 
 
 def test_glimpses_come_once_a_process_can_be_started_again(monkeypatch: pytest.MonkeyPatch) -> None:
