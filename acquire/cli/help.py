@@ -49,6 +49,7 @@ def _rows(rows: Any) -> Iterator[str]:
             columns(),
             initial_indent=f"  {name:<{NAMES}}  ",
             subsequent_indent=" " * (NAMES + 4),
+            # Options have hyphens in their names.
             break_on_hyphens=False,
         )
 

@@ -131,6 +131,7 @@ def import_lines(
     from acquire.exchange import Layout, import_lines
     from acquire.store.delivery import check_new_place
 
+    # What can be refused by the arguments alone is refused before the files are opened, which may be large.
     if len(files) > 2:
         raise UsageError(
             f"{len(files)} files of lines were given", possible="one for each arm, or one with both"

@@ -83,6 +83,7 @@ def _wrapped(text: str, indent: int, columns: int) -> list[str]:
         return [text]
     return textwrap.wrap(
         text,
+        # A terminal narrower than the names would leave no room for the values.
         max(columns, 2 * indent),
         subsequent_indent=" " * indent,
         break_long_words=False,

@@ -87,6 +87,7 @@ def paper(
 
     options = Options(preset, solver, None, budget)  # type: ignore[arg-type]  # checked when it is used
     made: list[Drawn] = []
+    # Threads of BLAS spin while they wait for cores that other programs use.
     with new_directory(out), activity_progress() as report, limit_blas(idle_cores()):
         for name in chosen:
             studio = Studio(out, options, seed, lambda text, name=name: report(f"{name}: {text}"))  # type: ignore[misc]

@@ -43,6 +43,7 @@ def build(modules: Iterable[str] = MODULES) -> typer.Typer:
         help=SUMMARY,
         epilog=EXAMPLE,
         no_args_is_help=True,
+        # `acquire completion` and `main` do these in our own words, as text or JSON.
         add_completion=False,
         pretty_exceptions_enable=False,
         context_settings={"help_option_names": list(_HELP)},
@@ -82,6 +83,7 @@ def run(words: Sequence[str]) -> int:
     # This module alone: a command need not wait for the imports of all others.
     command = command_of([BY_NAME[first].module])
     try:
+        # Not standalone: errors come back to `main`, which prints them.
         code = command(args=list(words), prog_name="acquire", standalone_mode=False)
     except typer.Abort:
         return EXIT_INTERRUPTED
