@@ -223,6 +223,52 @@ def test_what_is_not_a_video_says_so(tmp_path):
         open_video(tmp_path / "g.zarr")
 
 
+def scaled(*scale):
+    return {
+        "multiscales": [
+            {
+                "axes": [{}],
+                "datasets": [{"coordinateTransformations": [{"type": "scale", "scale": list(scale)}]}],
+            }
+        ]
+    }
+
+
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [
+        ("ome", 5),
+        ("ome", {"multiscales": []}),
+        ("ome", scaled("x", 1, 1)),
+        ("ome", scaled(0, 1, 1)),
+        ("ome", scaled(1e999, 1, 1)),
+        ("ome", scaled(1, 1)),
+        ("provenance", 5),
+        ("provenance", {"trusted": 5}),
+        ("provenance", {"trusted": ["a", "b"]}),
+        ("provenance", {"trusted": [1e999, 5]}),
+        ("provenance", {"error": 5}),
+        ("provenance", {"segments": 5}),
+        ("provenance", {"segments": [5]}),
+    ],
+    ids=str,
+)
+def test_impossible_attributes_of_a_video_are_damage(tmp_path, key, value):
+    write_video(tmp_path / "v.zarr", *make(), 5.0, 30_000.0, {"trusted": [1, 4]})
+    root = json.loads((tmp_path / "v.zarr" / "zarr.json").read_text())
+    root["attributes"][key] = value
+    (tmp_path / "v.zarr" / "zarr.json").write_text(json.dumps(root))
+    with pytest.raises(DataError, match="is damaged"):
+        open_video(tmp_path / "v.zarr")
+
+
+def test_times_that_are_not_those_of_the_frames_are_damage(tmp_path):
+    write_video(tmp_path / "v.zarr", *make(), 5.0, 30_000.0, {})
+    zarr.open_array(tmp_path / "v.zarr" / "time").resize((3,))
+    with pytest.raises(DataError, match="3 times"):
+        open_video(tmp_path / "v.zarr")
+
+
 def test_a_pipe_in_the_place_of_a_video_keeps_nobody_waiting(tmp_path):
     (tmp_path / "v.zarr").mkdir()
     os.mkfifo(tmp_path / "v.zarr" / "zarr.json")
