@@ -127,8 +127,9 @@ class ArmWriter:
             array.sync()
 
     def close(self) -> None:
-        for array in self._arrays.values():
-            array.close()
+        with contextlib.ExitStack() as closing:  # one that fails does not keep the others open
+            for array in self._arrays.values():
+                closing.callback(array.close)
 
     def publish(self, publisher: Publisher, rows: int, *, own: bool) -> dict[str, layout.Document]:
         """Return the metadata of ``rows`` rows, by path below the recording.

@@ -17,7 +17,7 @@ import json
 import os
 import time
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Self
 
@@ -352,13 +352,14 @@ class RecordingWriter:
         for threads in (self._pool, self._behind):
             if threads is not None:
                 threads.shutdown(cancel_futures=True)
-        with self._failing("closing files"):
-            for arm in self._arms.values():
-                arm.close()
-            # The lock last: whoever gets it may recover the recording, which must not be written any more.
+        # From the last callback to the first, even if some fail. The lock last: whoever gets it may recover
+        # the recording, which must not be written any more.
+        with self._failing("closing files"), ExitStack() as closing:
             if self._lock >= 0:
-                held, self._lock = self._lock, -1
-                os.close(held)
+                closing.callback(os.close, self._lock)
+                self._lock = -1
+            for arm in self._arms.values():
+                closing.callback(arm.close)
 
     @property
     def _durable(self) -> bool:

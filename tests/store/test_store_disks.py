@@ -28,6 +28,7 @@ from acquire.store import (
     recover,
     verify,
 )
+from acquire.store.array_writer import ArrayWriter
 from acquire.store.delivery import whole_file
 from acquire.store.files import Disk, ShardFile
 from acquire.store.pages import PAGE, aligned_bytes, is_aligned, open_direct
@@ -384,3 +385,24 @@ def test_a_file_that_vanishes_while_sizes_are_added_up_counts_nothing(tmp_path, 
 
     monkeypatch.setattr(Path, "stat", stat)
     assert files.tree_bytes(tmp_path) in (4, 5)
+
+
+def test_a_file_that_cannot_be_closed_keeps_neither_the_others_nor_the_lock(path, monkeypatch):
+    """As on a network disk, which may report a failed write only then."""
+    writer = RecordingWriter.create(path, make_spec(codec="none"))
+    fill(writer, 40)
+    really, closed = ArrayWriter.close, []
+
+    def close(array):
+        really(array)
+        closed.append(array)
+        if len(closed) == 1:
+            raise OSError(errno.EIO, os.strerror(errno.EIO))
+
+    monkeypatch.setattr(ArrayWriter, "close", close)
+    with pytest.raises(DataError, match="the disk failed while closing files"):
+        writer.close()
+    assert len(closed) == 12
+    with files.locked(path, "reading"):
+        pass
+    writer.close()
