@@ -177,10 +177,12 @@ class Mirror:
         refuse_links(path)
         self._identity = _identity(open_recording(path).attrs)
         if (there := self.target.path) is not None and os.path.lexists(there):
+            # It would replace the files that are being written by copies of themselves.
             if there.exists() and there.samefile(path):
                 raise UsageError(
                     f"{url} is the recording itself, not a place for its copy", hint="another URL"
                 )
+            # Through a link there, the copy would overwrite something else.
             refuse_links(there)
         self._bytes = 0
         self._shards = 0
