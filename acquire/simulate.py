@@ -195,6 +195,7 @@ def _write(
     except BaseException as error:
         aborted = isinstance(error, Exception)
         reason = str(error.message if isinstance(error, AcquireError) else error) or "interrupted"
+        # Sealed in any case: what was simulated can be read, and says that it is not all.
         writer.seal(RunCondition.ABORTED if aborted else RunCondition.INTERRUPTED, reason, {})
         raise
     condition = RunCondition.INCOMPLETE if any(lost.values()) else RunCondition.GOOD

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import shutil
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
@@ -12,9 +13,10 @@ import numpy as np
 
 from acquire.codes import PrbsCode
 from acquire.config.recording import usual_chunk_lines, usual_tag_chunks
-from acquire.errors import UsageError
+from acquire.errors import StateError, UsageError
 from acquire.lines import ARMS
 from acquire.store import RecordingSpec
+from acquire.store.files import locked
 from acquire.store.shape import CODECS
 from acquire.trigger.base import TriggerRun
 
@@ -90,6 +92,7 @@ class Load:
 
 def tag_every_lines(load: Load) -> int:
     """Return the lines per tag: at least one tag per block, and four per ring."""
+    # Within the limit of a rig, which is a third of the ring (`RigConfig`).
     return min(load.block_lines, load.ring_slots * load.block_lines // 4)
 
 
@@ -105,8 +108,12 @@ def trigger_run(load: Load) -> TriggerRun:
 def scratch_path(directory: Path, kind: str) -> Path:
     """Return a path for this process's recording, and remove those of processes that were killed."""
     for leftover in directory.glob(f".{kind}-*.zarr"):
-        if not Path("/proc", leftover.stem.removeprefix(f".{kind}-")).exists():
-            shutil.rmtree(leftover, ignore_errors=True)
+        number = leftover.stem.removeprefix(f".{kind}-")
+        # Our own number, too: in a container a daemon has the same one after every start. The lock shows a
+        # measurement by a process that cannot be seen from here, such as that of another container.
+        if number == str(os.getpid()) or not Path("/proc", number).exists():
+            with suppress(StateError, OSError), locked(leftover, "removing"):
+                shutil.rmtree(leftover, ignore_errors=True)
     return directory / f".{kind}-{os.getpid()}.zarr"
 
 

@@ -116,12 +116,14 @@ def _measure(
     capture.start(
         Begin(path, recording_spec(load, capture.clock), max(1, round(load.line_rate_hz * seconds)))
     )
+    # While arming, lines wait for processes that are only starting, which is no part of the load.
     for histogram in latencies.values():
         histogram.clear()
     before, begun = _cpu_s(pids), time.monotonic()
     while not (status := capture.poll()).draining and not status.done:
         _check(status, begun + seconds)
         time.sleep(_POLL_S)
+    # Until here lines came: the time of sealing is no part of the load.
     elapsed_s = time.monotonic() - begun
     cores = {name: (used - before[name]) / elapsed_s for name, used in _cpu_s(pids).items()}
     while not (status := capture.poll()).done:

@@ -44,6 +44,7 @@ def main() -> int:
             return run(sys.argv[1:])
     except AcquireError as error:
         return _failed(error)
+    # Extras are imported where they are needed: a missing one shows only now.
     except ModuleNotFoundError as error:
         return _failed(not_installed(error))
     except OSError as error:
@@ -52,6 +53,7 @@ def main() -> int:
             sys.stdout.flush()
         except OSError:
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        # As other programs end in `acquire ls | head`.
         if error.errno == errno.EPIPE:
             return 1
         where = f"{error.filename}: " if error.filename else ""

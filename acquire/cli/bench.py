@@ -85,6 +85,7 @@ def bench(
         )
     with stage_progress(f"recording up to {runs} times") as advance:
         reporter = _TrialReporter(advance, runs, aloud=not json)
+        # From the rate that the parts reach alone: together they reach no more.
         trials = search_rate(
             load, directory, parts.line_rate_hz, seconds=seconds, progress=reporter, most_runs=runs
         )
@@ -93,6 +94,7 @@ def bench(
         print_json(_facts(load, parts, trials, found))
     elif found is not None:
         columns = ("lines/s", "MB/s", "lost", "ring peak", "cores", "latency p99.9", "")
+        # The search goes up and down; read by rate, the table shows where losses begin.
         slowest_first = sorted(trials, key=lambda trial: trial.line_rate_hz)
         say()
         print_table(columns, [_row(load, trial, found) for trial in slowest_first])

@@ -125,8 +125,8 @@ def flat(
 ) -> None:
     """Measure the gain of every column and the balance of the arms, from a white scene in steady light.
 
-    Put in a uniform white scene that is larger than the field, and record with the light's code 1 at 50 to
-    70 % of white. 1024 lines give gains to 0.05 %. The dark step must come first.
+    Place a uniform white scene, larger than the field, before the lens, and record with the light's code 1 at
+    50 to 70 % of white. 1024 lines give gains to 0.05 %. The dark step must come first.
 
     Example: [bold]acquire calibrate flat flat.zarr --out cal.zarr[/]
     """
@@ -173,8 +173,9 @@ def orientation(
 ) -> None:
     """Find out how arm B's view is rotated or mirrored against arm A's, and whether the arms are swapped.
 
-    Put in a stationary target with sharp, irregular texture and record with the usual pseudo-random code.
-    1024 lines are enough. If the lines do not decide between the eight views, the command says so.
+    Place a stationary target with sharp, irregular texture before the lens, and record with the usual
+    pseudo-random code. 1024 lines are enough. If the lines do not decide between the eight views, the command
+    reports it.
 
     Example: [bold]acquire calibrate orientation target.zarr --out cal.zarr[/]
     """
@@ -197,9 +198,10 @@ def align(
 ) -> None:
     """Measure how arm B's image lies on arm A's: shift, rotation and magnification.
 
-    Put in a stationary target with sharp texture all over the field, dots or bars of 2 to 6 fine pixels, and
-    record with the usual pseudo-random code. 1024 lines give 0.02 fine pixels; 263 are too few. It is best
-    done after dark and flat. Behind a fibre each tile is aligned separately, along its fibre bands.
+    Place a stationary target before the lens that fills the field with sharp texture, dots or bars of 2 to 6
+    fine pixels, and record with the usual pseudo-random code. 1024 lines give 0.02 fine pixels; 263 are too
+    few. It is best done after dark and flat. Behind a fibre each tile is aligned separately, along its fibre
+    bands.
 
     Example: [bold]acquire calibrate align target.zarr --out cal.zarr[/]
     """
@@ -223,9 +225,10 @@ def psf(
 ) -> None:
     """Measure the width of each arm's optical blur from straight, sharp edges. This step is optional.
 
-    Put in a square or a checkerboard, rotated by 3 to 20 degrees, with edges at least 30 fine pixels apart,
-    stationary and in focus, and record with the usual pseudo-random code. 1024 lines give 0.05 fine pixels.
-    If the lines do not determine the blur, the command says so. Reconstructions then correct the blur.
+    Place a square or a checkerboard before the lens, rotated by 3 to 20 degrees, stationary and in focus,
+    with edges at least 30 fine pixels apart, and record with the usual pseudo-random code. 1024 lines give
+    0.05 fine pixels. If the lines do not determine the blur, the command reports it. Reconstructions then
+    correct the blur.
 
     Example: [bold]acquire calibrate psf edges.zarr --out cal.zarr[/]
     """
@@ -325,6 +328,7 @@ def _exposure(
     from acquire.store import open_recording
 
     if begin is not None or end is not None:
+        # Numbers are left to `open_exposure`, which knows what a calibration needs.
         first_line, lines = lines_between(open_recording(recording), first_line, lines, begin, end)
     return open_exposure(recording, first_line, lines)
 
@@ -341,6 +345,7 @@ def _known_or_new(place: str, recording: str) -> Calibration:
     from acquire.calibrate.exposure import instrument_of
     from acquire.store import open_recording
 
+    # These steps need no earlier ones, and may be a calibration's first.
     if _exists(place):
         return _known(place)
     return Calibration(instrument_of(open_recording(recording)))
@@ -357,6 +362,7 @@ def _keep(place: str, found: Finding, *, json: bool, new: bool = False) -> None:
     from acquire.calibrate import Calibration, save_calibration
 
     known = Calibration(found.instrument) if new and not _exists(place) else _known(place)
+    # Shown all the same: the figures say by how little the views differ. Saved, it would count as known.
     if found.step == "orientation" and found.orientation is None:
         _print_finding(found, None, json=json)
         raise UsageError(

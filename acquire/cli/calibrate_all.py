@@ -73,6 +73,7 @@ def calibrate_all(
     names = [step.name for step in (*AT_ONCE, *OPTIONAL)]
     if wrong := [each for each in only or () if each not in names]:
         raise UsageError(f"there is no step {wrong[0]!r}", possible=", ".join(names))
+    # In the order of the guide, whatever the order of the options: later steps need earlier ones.
     steps = [step for step in AT_ONCE if not only or step.name in only]
     if psf or PSF.name in (only or ()):
         steps.append(PSF)
@@ -113,11 +114,13 @@ def _step(
             exposure = record(daemon, step.name, directory, lines, code=step.code)
             found = []
             for evaluate in _evaluations(step, exposure, out):
+                # Saved one by one: the next evaluation of the same recording builds on this one.
                 found.append(save_finding(out, exposure, evaluate))
                 if not quiet:
                     print_finding(found[-1])
                     say()
         except UsageError as error:
+            # Without anybody to correct the cause, the next attempt would fail in the same way.
             if not (ask and left):
                 raise
             print_warning(f"{step.name}: {error}")

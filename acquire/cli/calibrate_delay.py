@@ -120,6 +120,7 @@ def _found(out: str, exposures: list[Exposure], *, whole: bool) -> Finding:
     if not whole and source_of(out).exists():
         known = open_calibration(out).quantities.get("light_late_ticks")
         ticks = float(found.quantities["light_late_ticks"].uncertainty.max())
+        # A sweep that Ctrl-C cut short must not spoil what a whole one has found.
         if known is not None and known.uncertainty.max() < ticks:
             raise UsageError(
                 f"this part of a sweep has an uncertainty of {ticks:.1f} ticks, more than the "

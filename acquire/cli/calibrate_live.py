@@ -39,6 +39,7 @@ def instrument(socket: Path | None, directory: Path) -> Iterator[Client]:
     from acquire.cli.progress import waiting_printer
     from acquire.client import Client
 
+    # The page runs this command: the recording's events must name who pressed the button.
     WHO.set(os.environ.get(BY, "")[:LONGEST])
     with Client(socket, waiting_printer()) as daemon:
         status = daemon.status()
@@ -87,6 +88,7 @@ def record(
         daemon.wait(SEALED, timeout_s=SEALED_S + lines / min(rates, default=1000.0))
         daemon.disarm()
         made = open_recording(path)
+        # A recording may also end early, without a gap, as when a camera stalls.
         missing = max(0, lines - made.lines) + sum(gap.count for gap in made.gaps)
         if missing <= MOST_LOST * lines:
             return open_exposure(path)
@@ -162,6 +164,7 @@ def _leave(daemon: Client, directory: Path, *, armed: bool) -> None:
     from acquire.client import SEALED
 
     status = daemon.status()
+    # A step that fails must not stop what somebody else has begun to record since.
     if status.recording is not None and status.recording.path.parent != directory.absolute():
         print_warning(
             f"{status.recording.path} is somebody else's recording, so the instrument stays as it is"

@@ -88,6 +88,7 @@ def snapshot(
     from acquire.store.refusals import refused
 
     path = out or Path(f"{serial}.png")
+    # Before the camera is opened, which takes long.
     _check_out(path)
     with Bench(config) as bench:
         seconds = OPEN_S + lines / bench.line_rate_hz

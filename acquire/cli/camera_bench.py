@@ -32,6 +32,7 @@ class Bench:
 
     @property
     def line_rate_hz(self) -> float:
+        # A guess for a camera with a trigger of its own, from which only time limits follow.
         return self.config.line_rate_hz if self.config else 1000.0
 
     def opener(self, serial: str) -> CameraOpener:
@@ -82,6 +83,7 @@ class Bench:
 
     def __exit__(self, *_: object) -> None:
         self._ending.set()
+        # A thread that was never started cannot be joined.
         if self._listener.ident is not None:
             self._listener.join(OPEN_S)
         if self._rig is not None:

@@ -101,6 +101,7 @@ def advice(reading: Reading | None) -> str:
         return "the camera does not respond"
     if reading.level is None:
         return "no lines are arriving: is the trigger running, and its cable connected to the camera's input?"
+    # In the order of urgency: the first that applies is shown.
     for wrong, text in (
         (reading.lost > 0, f"{reading.lost} lines were lost: check acquire status and the camera's settings"),
         ((reading.saturated or 0.0) > SATURATED, "saturated: use less light or a smaller aperture"),

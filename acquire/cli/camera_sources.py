@@ -70,6 +70,7 @@ class CameraSource:
         try:
             for serial, views in self._views().items():
                 camera = LiveCamera(f"camera {serial}", self._bench.opener(serial), views, OPEN_S)
+                # At once: what is opened so far is closed if the next camera fails.
                 self._end.callback(camera.close)
                 self._cameras.append(camera)
                 self.names |= dict.fromkeys(views, serial)
@@ -98,6 +99,7 @@ class CameraSource:
         for arm in arms:
             camera = config.cameras.arm(arm)
             view = View(config.columns.get(arm), camera.black_level_dn, camera.white_dn)
+            # One camera may carry both arms (layout `compact`): it is opened once, and read in two views.
             views.setdefault(camera.serial, {})[arm] = view
         return views
 

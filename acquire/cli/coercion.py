@@ -37,6 +37,7 @@ class Quick:
             return None
         if isinstance(value, bool) and self._type is bool:
             return value
+        # What needs more than a conversion is left to typer: its validator takes long to build, but is right.
         if self._type in (None, bool) or several:
             return self._slow().coerce(value, param=param, ctx=ctx)
         try:

@@ -67,6 +67,7 @@ def complete(command: Any) -> int:
     _without_help(command)
     try:
         command(args=[], prog_name=PROGRAM, complete_var=VARIABLE)
+    # typer exits the process itself.
     except SystemExit as ended:
         return ended.code if isinstance(ended.code, int) else 1
     return 0
@@ -126,6 +127,7 @@ def _paths(incomplete: str, suffixes: Iterable[str]) -> list[str]:
     parent, _, begun = incomplete.rpartition("/")
     base = Path(f"{parent}/" if incomplete.startswith("/") or parent else ".")
     found = []
+    # Nothing to offer is better than a traceback in the middle of a command line.
     with suppress(OSError):
         for path in sorted(base.iterdir()):
             # As shells do: hidden names are offered once a dot has been typed.

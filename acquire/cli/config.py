@@ -105,6 +105,7 @@ def check(file: FileArgument, json: JsonFlag = False) -> None:
     check_rig(rig)
     if rig.needs_scene:
         load_scene(rig.scene_file())
+    # As `serve` does: what would fail there is refused here, with the rig file at hand.
     check_host(rig)
     check_upload(rig)
     facts = _facts(rig)

@@ -142,6 +142,7 @@ def stop(socket: SocketOption = None, json: JsonFlag = False) -> None:
     """
     with _daemon(socket) as daemon:
         status = daemon.stop()
+    # Shown before the error: the other lines are recorded all the same.
     show(status, json)
     last = status.last
     if last is not None and last.condition in DAMAGED:

@@ -64,6 +64,7 @@ def of_rig(config: str) -> Iterator[Row]:
 
     rig_config = load_rig(config)
     with Rig(rig_config) as rig:
+        # A device that fails is a row like the others: the next one may be the one that was meant.
         row = {"device": "trigger", "serial": "", "model": "", "firmware": ""}
         try:
             found = rig.trigger.identify()

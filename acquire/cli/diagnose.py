@@ -62,6 +62,7 @@ def diagnose(
     chosen = choose(opened, calibration)
     first, count = diagnosed_range(opened, *lines_between(opened, first_line, lines, begin, end))
     known, named = None if chosen is None else chosen.calibration, tile_of(opened, tile)
+    # moving=False: a diagnosis needs contrast, and not change.
     seen = representative_tile(opened, () if named is None else (named,), (first, count), known, moving=False)
     found = diagnose_recording(opened, first, count, known, seen)
     whose = {} if seen is None else {"tile": str(seen)}

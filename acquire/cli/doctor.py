@@ -55,6 +55,7 @@ def doctor(
     rig = None if config is None else load_rig(config)
     running: str | None = None  # version of the daemon that is running
     with suppress(AcquireError):
+        # At the rig's own socket: a daemon of another rig elsewhere does not concern it.
         running = Client(socket or (rig.control.socket if rig else None)).status().version
     # A daemon that is running has the devices open, and may be recording.
     findings = [*examine(rig, running), *(_devices(config) if config and running is None else ())]

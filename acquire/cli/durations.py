@@ -42,6 +42,7 @@ def duration_ns(text: str) -> float | None:
         value = float(found[1]) * UNITS_NS[found[2]]
     except ValueError:
         return None
+    # `1e999` is a valid float, and infinite.
     return value if math.isfinite(value) and value >= 0 else None
 
 

@@ -86,6 +86,7 @@ def export(
         raise UsageError(f"--fps {fps} is out of range", possible="0.1 to 240")
     if peak is not None and not (math.isfinite(peak) and peak > 0):
         raise UsageError(f"--peak {peak} is out of range", possible="a finite number above 0")
+    # Refused before the source is opened, which may be far away.
     format_for(out)
     check_new_path(out)
     if (format_of(source) or "").startswith("acquire-video/"):

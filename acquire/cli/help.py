@@ -49,12 +49,14 @@ def _rows(rows: Any) -> Iterator[str]:
             columns(),
             initial_indent=f"  {name:<{NAMES}}  ",
             subsequent_indent=" " * (NAMES + 4),
+            # Options have hyphens in their names.
             break_on_hyphens=False,
         )
 
 
 def make_plain(command: Any) -> None:
     """Make a command and its subcommands print their help as plain text, as wide as the terminal."""
+    # rich takes most of a help's time, and its tables do not fit a narrow terminal.
     command.rich_markup_mode = None
     command.context_settings["max_content_width"] = columns()
     for name in ("help", "short_help", "epilog"):

@@ -131,6 +131,7 @@ def import_lines(
     from acquire.exchange import Layout, import_lines
     from acquire.store.delivery import check_new_place
 
+    # What can be refused by the arguments alone is refused before the files are opened, which may be large.
     if len(files) > 2:
         raise UsageError(
             f"{len(files)} files of lines were given", possible="one for each arm, or one with both"
@@ -189,7 +190,7 @@ def _levels(known: Mapping[str, float], options: Mapping[str, float | None]) -> 
 def _columns(text: str | None) -> tuple[int, int] | None:
     if text is None:
         return None
-    found = re.fullmatch(r"(\d+):(\d+)", text)
+    found = re.fullmatch(r"(\d{1,9}):(\d{1,9})", text)
     if found is None:
         raise UsageError(f"columns {text!r} cannot be read", possible="FIRST:END, such as 0:192")
     return int(found[1]), int(found[2])
@@ -266,6 +267,7 @@ def _instrument(
             substeps=known.substeps if substeps is None else substeps,
             code=light or known.code,
         )
+        # Another line rate or number of sub-steps needs other ticks than the rig's.
         if line_rate is not None or found.substeps != known.substeps:
             rate_hz = known.line_rate_hz if line_rate is None else line_rate
             # Before `clock_of`, which would never end for a rate of 0.

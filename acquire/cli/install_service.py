@@ -56,7 +56,9 @@ def install_service(
     place = Place.of(user=user)
     where = directory or place.directory
     rules = (directory or Path("/etc/udev/rules.d")) / RULES
+    # By the path of the rig file, also of a built-in one: systemd starts the daemon in another directory.
     files = {where / UNIT: unit_text(rig, find(config, kind="rig"), user=user, account=account)}
+    # Only root may write rules for devices.
     if not user:
         files[rules] = UDEV
     if not (install or directory):

@@ -12,7 +12,8 @@ from acquire.errors import UsageError
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-_LINE = re.compile(r"\s*[Ll](\d+)\s*")
+# Python refuses to convert thousands of digits, and a float those of more than 308.
+_LINE = re.compile(r"\s*[Ll](\d{1,18})\s*")
 
 
 def line_number(text: str) -> int | None:
@@ -29,6 +30,7 @@ def utc_ns(text: str) -> int | None:
         return None
     if moment is None:
         return None  # 20260131 is a number of seconds, like every bare number
+    # In whole numbers: a float of seconds since 1970 is exact to 0.2 us only.
     since = (moment if moment.tzinfo else moment.replace(tzinfo=UTC)) - datetime.fromtimestamp(0, UTC)
     return (since.days * 86_400 + since.seconds) * UNITS_NS["s"] + since.microseconds * UNITS_NS["us"]
 

@@ -44,6 +44,7 @@ def print_json(value: Any) -> None:
 def json_text(value: Any, indent: int | None = None) -> str:
     """Return JSON that can be encoded and shown anywhere: unprintable characters become ``\\uXXXX``."""
     text = json.dumps(value, indent=indent, default=str, ensure_ascii=False)
+    # Readable where it can be: only what a terminal could take for a command is escaped.
     return _IN_JSON.sub(
         lambda found: found[0] if found[0].isprintable() else json.dumps(found[0])[1:-1], text
     )
@@ -82,6 +83,7 @@ def _wrapped(text: str, indent: int, columns: int) -> list[str]:
         return [text]
     return textwrap.wrap(
         text,
+        # A terminal narrower than the names would leave no room for the values.
         max(columns, 2 * indent),
         subsequent_indent=" " * indent,
         break_long_words=False,
@@ -113,6 +115,7 @@ def table_lines(columns: Iterable[str], rows: Iterable[Iterable[Any]]) -> list[s
     cells = [[visible(cell) for cell in row] for row in rows]
     titles = list(columns)
     widths = [max(map(len, column)) for column in zip(titles, *cells, strict=True)]
+    # A row that the terminal breaks can be read by nobody.
     if sum(widths) + 2 * (len(widths) - 1) > line_width():
         blocks = [fact_lines({t: cell for t, cell in zip(titles, row, strict=True) if cell}) for row in cells]
         return [line for block in blocks for line in ("", *block)][1:]
@@ -134,6 +137,7 @@ def json_requested() -> bool:
 def print_error(error: AcquireError, *, as_json: bool) -> None:
     """Print an error to stderr: the message, what is possible, what to try. As JSON: ``{"error": {…}}``."""
     if as_json:
+        # `kind`, since the object itself is called error.
         facts = error.to_dict()
         about = {"kind": facts.pop("error"), **facts}
         typer.echo(json_text({"error": about}), err=True)

@@ -71,6 +71,7 @@ def paper(
     if wrong := [name for name in chosen if name not in NAMES]:
         raise UsageError(f"there is no figure {wrong[0]!r}", possible=", ".join(NAMES))
     if recording is not None:
+        # The other figures show scenes of their own, of which a recording has none.
         if figures not in (None, [], ["fig9"]):
             raise UsageError(f"{', '.join(figures)} cannot be made from a recording", possible="fig9")
         chosen = ["fig9"]
@@ -86,6 +87,7 @@ def paper(
 
     options = Options(preset, solver, None, budget)  # type: ignore[arg-type]  # checked when it is used
     made: list[Drawn] = []
+    # Threads of BLAS spin while they wait for cores that other programs use.
     with new_directory(out), activity_progress() as report, limit_blas(idle_cores()):
         for name in chosen:
             studio = Studio(out, options, seed, lambda text, name=name: report(f"{name}: {text}"))  # type: ignore[misc]

@@ -1,8 +1,10 @@
-"""Paths on this machine: arguments that must not be URLs, and output directories."""
+"""Paths on this machine: arguments that must not be URLs, output directories, and private ones."""
 
 from __future__ import annotations
 
 import contextlib
+import os
+import tempfile
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -10,6 +12,11 @@ from acquire.errors import UsageError
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
+
+SOCKET = "c.sock"
+"""Name of the control socket in a `private_directory`."""
+LONGEST_SOCKET = 90
+"""Longest path of a socket (bytes) that every system accepts."""
 
 
 def local_path(text: str) -> Path:
@@ -22,6 +29,17 @@ def local_path(text: str) -> Path:
             hint="the recording where it was made; info, verify, cut, reconstruct and replay accept URLs",
         )
     return Path(text.removeprefix("file://"))
+
+
+@contextlib.contextmanager
+def private_directory() -> Iterator[Path]:
+    """Make a temporary directory for a daemon's socket and files, removed at the end of the block."""
+    with contextlib.ExitStack() as held:
+        name = held.enter_context(tempfile.TemporaryDirectory(prefix="acquire-"))
+        # TMPDIR may be deeper than the path of a socket may be long.
+        if len(os.fsencode(f"{name}/{SOCKET}")) > LONGEST_SOCKET:
+            name = held.enter_context(tempfile.TemporaryDirectory(prefix="acquire-", dir="/tmp"))
+        yield Path(name)
 
 
 @contextlib.contextmanager

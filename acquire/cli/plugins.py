@@ -32,6 +32,7 @@ def plugins(json: JsonFlag = False) -> None:
         return
     shown = [row | {"state": "broken" if row["error"] else "ok"} for row in rows]
     print_table(COLUMNS, [[row[column] for column in COLUMNS] for row in shown])
+    # Below the table, which long errors would make too wide for a terminal.
     for row in rows:
         if row["error"]:
             say(f"{row['kind']} {row['name']} of {row['distribution']} {row['version']}: {row['error']}")

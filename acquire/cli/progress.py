@@ -91,6 +91,7 @@ class Progress:
         return f"{self._done:.{digits}f} of {self._total:.0f}"
 
     def __enter__(self) -> Self:
+        # Two bars at a time would overwrite each other.
         if Progress._shown:
             Progress._shown[-1]._pause()
         Progress._shown.append(self)
@@ -127,6 +128,7 @@ class Progress:
         printer, self._printer = self._printer, None
         if printer is not None:
             self._over.set()
+            # So that no line of it comes after the command's results.
             printer.join()
 
     def _print(self) -> None:

@@ -187,8 +187,9 @@ def reconstruct(
     from acquire.reconstruct import Options
     from acquire.store import open_recording
 
-    # Everything that can be wrong is checked before the solver runs.
+    # A budget is the time of the whole command: the imports above count, too.
     began = time.monotonic() - _age_s()
+    # Everything that can be wrong is checked before the solver runs.
     _check_options(search, (workers, dask), anything_wanted=bool(out or auto or explain))
     solver_options = parse_settings(settings or ())
     open_solver(solver, solver_options)
@@ -226,6 +227,7 @@ def reconstruct(
         tiles=chosen_tiles,
     )
     check_arguments(arguments, explain=explain)
+    # A place that is taken is refused before minutes of computing.
     places = [] if out is None else _new_places(out, suffixes(arguments))
     for doubt in () if chosen is None else chosen.doubts:
         print_warning(doubt)
@@ -313,6 +315,7 @@ def _make(
             share_s = (options.budget_s - elapsed_s) / (len(places) - len(outcomes))
             options = replace(options, budget_s=max(elapsed_s + share_s, LEAST_S))
         outcomes.append(_run(recording, request, place, options, where, began))
+        # Ctrl-C is meant for the whole command.
         if outcomes[-1].interrupted:
             break
     return outcomes
@@ -342,6 +345,7 @@ def _with_orientation(recording: Recording, arguments: Arguments) -> Arguments:
     first, count = diagnosed_range(recording, *requested_lines(recording, arguments))
     found = diagnose_recording(recording, first, count, arguments.options.calibration)
     turn = AS_BUILT if found.hypothesis is None else found.hypothesis.turn
+    # Only if nothing else explains the lines as well: a wrong turn would spoil a video that is right.
     if found.standing is Standing.NAMED and turn != AS_BUILT and found.alternative is None:
         note(f"{TURNED[turn]}; the reconstruction corrects this")
         return replace(arguments, options=replace(arguments.options, turn=turn))
@@ -353,6 +357,7 @@ def _age_s() -> float:
     """Time since this command began: the age of its process, unless another program called it."""
     from acquire.cores import process_age_s
 
+    # The age of a program that calls us, such as a test's, would be taken off the budget.
     program = Path(getattr(sys.modules["__main__"], "__file__", None) or "")
     return process_age_s() if "acquire" in (program.name, program.parent.name) else 0.0
 

@@ -104,6 +104,7 @@ def prepare(recording: Recording, arguments: Arguments) -> Prepared:
         choice = Choice(None, "")
     else:
         grids = [request.grid for request in requests.values()]
+        # The whole work has to fit the limit: all videos, and all tiles of each.
         tiles = max(1, *(len(request.tiles) for request in requests.values()))
         choice = choose(known, options.budget_s, tiles * sum(grid.frames * grid.side**2 for grid in grids))
     options = replace(options, preset=choice.preset or options.preset)  # type: ignore[arg-type]  # checked when it is used
@@ -137,6 +138,7 @@ def check_arguments(arguments: Arguments, *, explain: bool = False) -> None:
             "iterations",
             possible="a part of the lines with coarse voxels: --from, --to and --voxels 6x4 --preset fast",
         )
+    # A preview has no plan, only coarse voxels.
     planned = bool(chosen) and not arguments.preview
     if arguments.save_plan is not None:
         if not planned:
@@ -175,7 +177,7 @@ def _requests(recording: Recording, arguments: Arguments) -> Prepared:
 
 def parse_voxels(text: str) -> Voxels:
     """Parse a voxel size: ``3x4`` is N_m = 3, T_m = 4."""
-    found = re.fullmatch(r"(\d+)[x×](\d+)", text)
+    found = re.fullmatch(r"(\d{1,18})[x×](\d{1,18})", text)
     if found is None:
         raise UsageError(f"the voxel size {text!r} cannot be read", possible="NMxTM, such as 3x1 or 1x820")
     return Voxels(int(found[1]), int(found[2]))
@@ -190,7 +192,7 @@ def parse_segment(text: str) -> dict[str, float]:
         "spatial_merge": voxels.spatial_merge,
         "temporal_merge": voxels.temporal_merge,
     }
-    if length.isdigit():
+    if re.fullmatch(r"\d{1,18}", length):  # not isdigit: to Python, ² is a digit and no number
         table["lines"] = int(length)
     elif length:
         table["seconds"] = parse_duration_ns(length) * 1e-9

@@ -64,6 +64,7 @@ def recording_facts(facts: dict[str, Any]) -> dict[str, Any]:
     if missing is not None:
         calibration = f"none: {missing}, named in the rig file, did not exist"
     elif steps := dict((facts["calibration"] or {}).get("steps", {})):
+        # ISO times: the greatest text is the latest.
         calibration = f"{', '.join(steps)}; {max(str(step.get('made', '')) for step in steps.values())}"
     suspect = [
         f"{one['arm']} {one['first_line']} to {one['first_line'] + one['count'] - 1} ({one['why']})"
@@ -110,6 +111,7 @@ def _imported(found: dict[str, Any] | None) -> str | None:
     """The source files of an imported recording, and what is not known about its lines."""
     if found is None:
         return None
+    # Once: both arms may come from the same file.
     files = dict.fromkeys(str(file.get("path")) for file in dict(found.get("files", {})).values())
     return f"from {', '.join(files)}; not known: {'; '.join(map(str, found.get('unknown', ())))}"
 

@@ -200,6 +200,7 @@ def upload(
     from acquire.store import mirror
     from acquire.store.remote import be_patient
 
+    # Before the store's library reads the environment.
     be_patient()
 
     def report(done: Mirrored) -> None:
@@ -244,6 +245,7 @@ def cut(
     from acquire.store import open_recording
     from acquire.store.files import check_new_path
 
+    # Now, and not only when it is written: reading and merging may take minutes.
     check_new_path(out)
     opened = open_recording(recording)
     first, count = lines_between(opened, first_line, lines, begin, end)
@@ -274,6 +276,7 @@ def _summary(path: Path) -> dict[str, Any] | None:
     from acquire.store.layout import DAMAGE
 
     try:
+        # A recording on a disk that is not mounted must not be left out without a word.
         if path.is_symlink() and not path.exists():
             return {"path": str(path), "error": f"{path}: a link to {path.readlink()}, which does not exist"}
         if not path.is_dir() or (format_of(path) or "").startswith("acquire-video/"):

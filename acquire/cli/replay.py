@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from acquire.cli.output import JsonFlag, print_facts, print_json
+from acquire.cli.places import SOCKET, private_directory
 from acquire.cli.progress import stage_progress
 from acquire.cli.recordings import PlaceArgument
 from acquire.errors import AcquireError, DataError, UsageError
@@ -25,8 +26,6 @@ FASTEST = 32.0
 """First speed tried by ``--speed 0``: at a few MHz, the trigger's tags alone keep a process busy."""
 SLOWER, TRIES = 4.0, 4
 """If lines are lost because the ring cannot hold the recording, each attempt is slower by this factor."""
-LONGEST_SOCKET = 90
-"""Longest path of a socket (bytes) that every system accepts."""
 
 
 def register(app: typer.Typer) -> None:
@@ -82,7 +81,7 @@ def replay(
             from acquire.cli.replay_rig import replay_rig
             from acquire.cli.serve import serve
 
-            with _private_directory() as directory:
+            with private_directory() as directory:
                 table = replay_rig(stored, speed or 1.0, Path.cwd(), replay_loop=loop)
                 serve(str(_rig_file(directory, table)), socket, None)
             return
@@ -135,6 +134,7 @@ def _download(source: Any, path: Path) -> Path:
 
     with refused(source, "read"):
         sizes = source.sizes()
+    # Refused before the download, and not by a full disk in the middle of it.
     room, size = shutil.disk_usage(path.parent).free, sum(sizes.values())
     if size > room:
         raise UsageError(
@@ -182,8 +182,8 @@ def _record(stored: Recording, out: Path, speed: float) -> str | None:
     from acquire.store import open_recording
 
     with ExitStack() as held:
-        directory = held.enter_context(_private_directory())
-        gate, socket, log = (directory / name for name in ("gate", "c.sock", "daemon.log"))
+        directory = held.enter_context(private_directory())
+        gate, socket, log = (directory / name for name in ("gate", SOCKET, "daemon.log"))
         table = replay_rig(stored, speed, directory, replay_gate=str(gate))
         # Flags are replayed; the time of a new verdict depends on the load.
         table["check"] = {"enable": False}
@@ -213,16 +213,6 @@ def _record(stored: Recording, out: Path, speed: float) -> str | None:
         if sum(map(len, again.lost_rows(arm))) > sum(map(len, stored.lost_rows(arm))) + dropped:
             return "the rings were full"
     return None
-
-
-@contextmanager
-def _private_directory() -> Iterator[Path]:
-    """Make a temporary directory for socket, rig and log, with a path that is short enough for a socket."""
-    with ExitStack() as held:
-        name = held.enter_context(tempfile.TemporaryDirectory(prefix="acquire-"))
-        if len(f"{name}/c.sock".encode()) > LONGEST_SOCKET:
-            name = held.enter_context(tempfile.TemporaryDirectory(prefix="acquire-", dir="/tmp"))
-        yield Path(name)
 
 
 def _rig_file(directory: Path, table: dict[str, Any]) -> Path:

@@ -85,6 +85,7 @@ def _slots(stored: Recording, block_lines: int) -> int:
     A gap ends a block, so every gap takes an extra slot.
     """
     needed = math.ceil(stored.lines / block_lines) + len(stored.gaps) + SPARE_SLOTS
+    # Of what is free now; what other programs could release is not counted on.
     free = os.sysconf("SC_AVPHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
     if os.path.isdir(SHARED_MEMORY):  # noqa: PTH112  # a fixed path of the system
         free = min(free, shutil.disk_usage(SHARED_MEMORY).free)

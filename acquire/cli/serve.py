@@ -66,6 +66,7 @@ def serve(
     overrides = parse_settings(settings or [])
     if socket is not None:
         overrides["control.socket"] = str(socket.absolute())
+    # Found once: a reload reads the same file, whatever the working directory is then.
     path = find(config, kind="rig").absolute()
 
     def read() -> RigConfig:
@@ -73,6 +74,7 @@ def serve(
         check_host(rig)
         return rig
 
+    # Before the daemon begins: a rig that cannot be used is an error of the command.
     rig = read()
     check_upload(rig)
     write_log(rig.service.level)

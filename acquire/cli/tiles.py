@@ -60,7 +60,7 @@ def tiles_of(recording: Recording, text: str | None) -> tuple[Tile, ...]:
         return ()
     if text is None:
         return fibre.tiles
-    found = re.fullmatch(r"(\d+)(?:-(\d+))?,(\d+)(?:-(\d+))?", text)
+    found = re.fullmatch(r"(\d{1,9})(?:-(\d{1,9}))?,(\d{1,9})(?:-(\d{1,9}))?", text)
     if found is None:
         raise UsageError(
             f"the tiles {text!r} cannot be read", possible="ROWS,COLUMNS from 0, such as 1,2 or 0-1,2-4"

@@ -207,6 +207,7 @@ def _cases(
         if source in SCENES:
             cases += [procedural(source, each, lines) for each in wells]
             continue
+        # As many lines as the last repeat will need.
         most = (first_line or FIRST_LINE) + lines + (repeats - 1) * APART
         recording, found = _opened(source, out, most)
         effects = effects or found
@@ -249,6 +250,7 @@ def _lessons(runs: list[Run]) -> list[Learned]:
         own = [run for run in runs if (run.case, run.voxels) == (case, voxels)]
         for (solver, preset, dtype), repeats in in_series(own).items():
             reached = [run.end.psnr_db for run in repeats if run.end.psnr_db is not None]
+            # `reconstruct` computes in float32 unless told otherwise.
             if dtype != "float32" or not reached or any(run.cut for run in repeats):
                 continue
             seconds = median(run.end.seconds for run in repeats)

@@ -52,6 +52,7 @@ def device_of(
 
     overrides = parse_settings(settings or [])
     if url is not None:
+        # A port on the command line means a board, whatever trigger the rig has.
         overrides |= {"trigger.driver": "serial", "trigger.url": url}
     rig = load_rig(config, overrides)
     driver = open_trigger(rig)

@@ -43,6 +43,7 @@ def build(modules: Iterable[str] = MODULES) -> typer.Typer:
         help=SUMMARY,
         epilog=EXAMPLE,
         no_args_is_help=True,
+        # `acquire completion` and `main` do these in our own words, as text or JSON.
         add_completion=False,
         pretty_exceptions_enable=False,
         context_settings={"help_option_names": list(_HELP)},
@@ -60,6 +61,7 @@ def run(words: Sequence[str]) -> int:
         from acquire.cli.completion import complete, words_so_far
 
         before = [word for word in words_so_far() if not word.startswith("-")][:1]
+        # Importing all commands for every Tab would be felt.
         modules = {BY_NAME[word].module for word in before if word in BY_NAME} or MODULES
         return complete(command_of(modules))
     first = words[0] if words else ""
@@ -78,8 +80,10 @@ def run(words: Sequence[str]) -> int:
         raise UsageError(
             f"{what}{did_you_mean(first, known)}", possible=", ".join(sorted(known)), hint="acquire --help"
         )
+    # This module alone: a command need not wait for the imports of all others.
     command = command_of([BY_NAME[first].module])
     try:
+        # Not standalone: errors come back to `main`, which prints them.
         code = command(args=list(words), prog_name="acquire", standalone_mode=False)
     except typer.Abort:
         return EXIT_INTERRUPTED

@@ -57,6 +57,7 @@ def _display(*, as_json: bool) -> Iterator[Callable[[Any], None]]:
     from rich.live import Live
     from rich.text import Text
 
+    # Refreshed by `draw` alone, at the user's interval.
     with Live(console=Console(), auto_refresh=False, vertical_overflow="visible") as live:
 
         def draw(status: Any) -> None:

@@ -94,6 +94,7 @@ def _settings(
     from acquire.place import default_socket
     from acquire.text import own_words
 
+    # The daemon has validated these settings, and knows more than its rig file says (--set).
     if given is not None:
         facts = json.loads(given)
         # As JSON: of Python objects, the strict models would refuse a list for a tuple, or a text for a path.

@@ -175,6 +175,7 @@ class AsyncClient:
         """Make a call; a command whose connection breaks is sent once more, with the same id."""
         try:
             return await self._once(call)
+        # Once: if the first request arrived, the second gets its answer, and nothing is done twice.
         except NoDaemonError:
             if call.request_id is None:
                 raise

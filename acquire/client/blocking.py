@@ -55,7 +55,7 @@ class Client:
         """Connect to nothing yet: each call makes its own connection.
 
         ``place`` is the socket's path, None for the default one, or http://HOST:PORT with its ``token`` (or
-        ACQUIRE_TOKEN). ``tell`` is called now and then with the reason of a wait.
+        ACQUIRE_TOKEN). ``tell`` is called with the reason of a wait, as long as it lasts.
         """
         self._target = Target.of(place, token)
         self._tell = tell

@@ -12,6 +12,7 @@ MOST_CHARACTERS = 4096
 MOST_SECONDS = 1e9
 """Thirty years; a longer time is a typing error."""
 MOST_DN = 1e9
+# Beyond this, JSON readers that know floats only are not exact.
 MOST_LINES = 2**53
 SEED_END = 2**128
 """Upper bound of seeds, which are stored in every recording as JSON."""

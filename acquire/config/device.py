@@ -227,6 +227,7 @@ class CamerasConfig(FrozenModel):
 
     @model_validator(mode="after")
     def _alike(self) -> CamerasConfig:
+        # Rings, recorder and code check have one type of sample and one white level for both arms.
         if self.a.pixel_format != self.b.pixel_format:
             raise ValueError(
                 f"both arms need the same pixel_format, not {self.a.pixel_format} and {self.b.pixel_format}"

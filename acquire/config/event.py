@@ -38,6 +38,7 @@ class EventsConfig(FrozenModel):
 
     @model_validator(mode="after")
     def _level_known(self) -> EventsConfig:
+        # A level within the hysteresis of 0 could rise once and never again: no mean goes below 0.
         if "threshold" in self.sources and not self.hysteresis_dn < self.level_dn:
             raise ValueError("source 'threshold' needs a level_dn above hysteresis_dn")
         return self

@@ -46,6 +46,7 @@ def find(name: str | Path, beside: Path | None = None, kind: str = "") -> Path:
 
     ``kind``, one of rig, scene and plan, selects the built-in files that an error lists.
     """
+    # The user's own files come first, whatever names the built-in ones have.
     candidates = [Path(name)]
     if beside is not None:
         candidates.append(beside.parent / name)
@@ -85,6 +86,7 @@ def load_rig(
         rig = rig.model_copy(update={"calibration": calibration.resolve()})
     if not rig.needs_scene:
         return rig
+    # What the rig file names goes first: the scene given is for a rig that leaves it open.
     scene = scene if scene is not None and rig.simulation.scene is None else rig.scene_file()
     scene_path = find(scene, beside=path, kind="scene").resolve()
     simulation = rig.simulation.model_copy(update={"scene": str(scene_path)})
@@ -112,6 +114,7 @@ def parse_settings(settings: Sequence[str]) -> dict[str, Any]:
         try:
             overrides[key.strip()] = tomllib.loads(f"value = {value}")["value"]
         except (ValueError, RecursionError) as error:
+            # Only what can be pasted into a shell as it is.
             quoted = f"""put text in quotes: "{key}='{value}'" """.rstrip()
             raise ConfigError(
                 f"setting {shown(setting)} has no valid TOML value: {shortened(error)}",

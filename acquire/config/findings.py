@@ -30,6 +30,7 @@ def explained(error: ValidationError, model: type[BaseModel], path: Path | str) 
             lines.append(f"  {key}: unknown key; allowed here: {', '.join(allowed) or 'none'}")
         elif item["type"] == "missing":
             lines.append(f"  {key}: missing")
+        # A whole table would be longer than the reason.
         elif isinstance(item["input"], dict):
             lines.append(f"  {key}: {why}")
         else:

@@ -23,6 +23,7 @@ USUAL_TAG_LINES = 4096
 def usual_chunk_lines(line_bytes: int, line_rate_hz: float) -> int:
     """Return the lines per chunk that suit this line size and rate: a power of two, at least 16."""
     most = min(USUAL_CHUNK_BYTES / line_bytes, USUAL_CHUNK_S * line_rate_hz)
+    # The least that a rig file may ask for (`chunk_lines`).
     return 1 << max(4, int(most).bit_length() - 1)
 
 

@@ -386,6 +386,7 @@ class RigConfig(FrozenModel):
     @property
     def history_s(self) -> float:
         """Seconds of past lines that a full ring is guaranteed to hold."""
+        # Neither the reserve nor the slot that is being filled holds the past.
         slots = self.ring_slots - self.ring_reserve - 1
         return max(0, slots) * self.stream.block_lines / self.line_rate_hz
 

@@ -140,6 +140,7 @@ class SceneBase(FrozenModel):
     kind: str
     title: str = ""
     rig: str = Field(default="rig-demo", description="the rig that `acquire simulate` uses for it")
+    # The default is a second of rig-demo.
     lines: int = Field(
         default=33_334, ge=1, le=MOST_LINES, description="number of lines that `acquire simulate` writes"
     )

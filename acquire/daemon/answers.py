@@ -45,6 +45,7 @@ class Answers:
         is completed even if the client goes away.
         """
         known = self._kept.get(request_id) if request_id is not None else None
+        # Otherwise the client would take the answer to something else for its own.
         if known is not None and known.request != request:
             raise UsageError(
                 f"request id {request_id} was given to another request before",

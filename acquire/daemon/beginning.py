@@ -32,6 +32,7 @@ async def begin(
         return
     log.info("service.begin: %s", config.begin)
     ours: str | None = None
+    # Both commands in one loop: a rig that was armed and could not record need not be armed again.
     while _is_untouched(status := service.status(), ours):
         try:
             if status.state is State.IDLE:
@@ -43,6 +44,8 @@ async def begin(
             text = f"service.begin: {error}; tried again in {config.retry_s:g} s"
             log.warning("%s", text)
             service.news.add("waiting", text, level="warning")
+        except Exception as error:  # noqa: BLE001 - otherwise nobody would learn why nothing is recorded
+            service.troubles.note("service.begin", error)
         else:
             return
         await asyncio.sleep(config.retry_s)

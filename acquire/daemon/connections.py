@@ -33,6 +33,8 @@ if TYPE_CHECKING:
 
     from starlette.types import ASGIApp
 
+# More than streams (`stream.MOST_STREAMS`) and commands (`server.MOST_WAITING`) can occupy together, which
+# leaves some for the status.
 MOST_CONNECTIONS = 32
 AT_ONCE = 16
 """Connections accepted in one turn of the event loop."""
@@ -47,7 +49,7 @@ IDLE_S = 5
 GRACE_S = 2
 """Time for current requests when the daemon ends, in whole seconds."""
 LAST_S = 0.7
-"""Time for open connections when the server ends: a stream never ends by itself, and half a request may stay
+"""Time for open connections when the server ends: a stream has no end of its own, and half a request may stay
 incomplete. If uvicorn cancelled them after `GRACE_S`, they would be answered with 500."""
 MOST_DESCRIPTORS = 65536
 
@@ -130,6 +132,7 @@ class Connection(H11Protocol):
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
         super().connection_made(transport)
+        # From the first moment: a client that connects and sends nothing occupies a descriptor.
         self._wait(REQUEST_S)
         if len(self.connections) > self.most_connections:
             # Close the connection that has waited for longest, or this one if all others are at work.
@@ -145,7 +148,7 @@ class Connection(H11Protocol):
         super().data_received(data)
         if self.is_working:
             self._cancel()
-        elif self._timer is None:  # a running timer is not prolonged by a byte now and then
+        elif self._timer is None:  # a running timer is not prolonged by single bytes
             self._wait(REQUEST_S)
 
     def on_response_complete(self) -> None:

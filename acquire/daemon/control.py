@@ -104,6 +104,7 @@ def _add_errors(app: FastAPI) -> None:
     @app.exception_handler(HTTPException)
     async def unknown(request: Request, error: HTTPException) -> JSONResponse:
         asked = shortened(f"{request.method} {request.url.path}")
+        # In our own form, so that a client shows every refusal alike.
         refusal = UsageError(
             f"the daemon cannot answer {asked}: {shortened(error.detail)}", possible="/openapi.json"
         )

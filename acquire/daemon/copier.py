@@ -213,6 +213,7 @@ class Copier:
             self._end(job, state="copied", error="", hint="", **facts)
             return
         self._report(job, state="copying", error="", hint="", **facts)
+        # Nothing new yet: the next look comes when a growing recording may have grown.
         if done.shards == before:
             job.not_before_s = time.monotonic() + LOOK_S
 

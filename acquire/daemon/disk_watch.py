@@ -37,7 +37,7 @@ def disk_watch(config: RigConfig) -> DiskWatch:
 
 
 class DiskWatch:
-    """Queries the directory's disk now and then; `check` never waits.
+    """Queries the directory's disk from time to time; `check` never waits.
 
     Parameters
     ----------
@@ -98,7 +98,8 @@ class DiskWatch:
     @property
     def status(self) -> DiskStatus | None:
         """Latest answer; None before the first one, and if the disk cannot be queried."""
-        looks = list(self._looks)
+        with self._changing:
+            looks = list(self._looks)
         if not looks:
             return None
         (first_s, first), (last_s, free) = looks[0], looks[-1]

@@ -39,6 +39,7 @@ DISK_GB = 50.0
 SPARE_MEMORY = 1.5
 """Required memory relative to that of the rings, to leave some for the rest of the capture."""
 NETWORK_DISKS = ("nfs", "nfs4", "cifs", "smb3", "fuse.sshfs", "9p", "ceph")
+# TIME_ERROR and STA_UNSYNC of the kernel's timex.h.
 _TIME_ERROR = 5
 _STA_UNSYNC = 0x40
 
@@ -79,6 +80,7 @@ def examine(rig: RigConfig | None, running: str | None) -> Iterator[Finding]:
 def _foreign_package() -> Finding:
     """Find other distributions with a package `acquire`, of which PyPI has one: they break each other."""
     owners = set(metadata.packages_distributions().get("acquire", ()))
+    # PyPI's acquire-imaging is one.
     others = sorted(owners - {"tdi-acquire"})
     if not others:
         return Finding("package", "good", "no other distribution installs a package `acquire`")
@@ -109,7 +111,7 @@ def _descriptors() -> Finding:
     return Finding(
         "descriptors",
         "warning",
-        f"a process may have {hard} only",
+        f"a process may have only {hard}",
         "LimitNOFILE=65536 in the unit, or nofile in /etc/security/limits.d/",
     )
 
@@ -154,10 +156,10 @@ def _realtime(rig: RigConfig | None) -> Finding:
 def _memory(rig: RigConfig | None) -> Finding:
     there = available_bytes()
     if rig is None:
-        return Finding("memory", "good", f"{there / 1e9:.1f} GB can be had")
+        return Finding("memory", "good", f"{there / 1e9:.1f} GB are available")
     line_bytes = rig.pixels * np.dtype(rig.cameras.a.dtype).itemsize
     rings = len(ARMS) * rig.ring_slots * rig.stream.block_lines * line_bytes
-    text = f"{there / 1e9:.1f} GB can be had, the rings take {rings / 1e9:.2f} GB"
+    text = f"{there / 1e9:.1f} GB are available, and the rings need {rings / 1e9:.2f} GB"
     if there > SPARE_MEMORY * rings:
         return Finding("memory", "good", text)
     return Finding("memory", "bad", text, "a smaller stream.ring_seconds, or end other programs")
@@ -166,7 +168,7 @@ def _memory(rig: RigConfig | None) -> Finding:
 def _disk(directory: Path) -> Iterator[Finding]:
     path = directory.absolute()
     if not path.is_dir():
-        yield Finding("disk", "bad", f"{path} is no directory", f"mkdir -p {path}, or recording.directory")
+        yield Finding("disk", "bad", f"{path} is not a directory", f"mkdir -p {path}, or recording.directory")
         return
     if not os.access(path, os.W_OK | os.X_OK):
         yield Finding("disk", "bad", f"{path} is not writable for this user", f"chown or chmod {path}")
@@ -216,7 +218,7 @@ def _clock() -> Finding:
     # With `modes` = 0 the call changes nothing, and needs no rights.
     state = ctypes.CDLL(None).adjtimex(ctypes.byref(timex))
     if state < 0:
-        return Finding("clock", "warning", "the kernel does not say whether the clock is set by others")
+        return Finding("clock", "warning", "the kernel does not report whether the clock is synchronised")
     if state == _TIME_ERROR or timex.status & _STA_UNSYNC:
         return Finding(
             "clock",

@@ -43,6 +43,8 @@ class Endpoint:
                 possible=f"a path of at most {LONGEST_PATH} bytes",
                 hint=ELSEWHERE,
             )
+        # The directory of any other path was chosen by the user, who may share it; clients look at it
+        # (`peer`).
         if path == default_socket():
             _own(path.parent)
         if not path.parent.is_dir():
@@ -95,6 +97,7 @@ def _own(directory: Path) -> None:
         raise UsageError(
             f"control socket in {directory}: that directory belongs to user {found.st_uid}", hint=ELSEWHERE
         )
+    # XDG_RUNTIME_DIR may let others look; whoever may write there could replace the socket.
     if stat.S_IMODE(found.st_mode) & (0o077 if in_tmp else 0o022):
         raise UsageError(
             f"control socket in {directory}: that directory is open to others "

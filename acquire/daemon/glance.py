@@ -39,6 +39,7 @@ def status_document(place: Path | None) -> dict[str, Any]:
             raise ConnectionRefusedError("a daemon is starting") from None
         connection.sock = connect(place, CONNECT_TIMEOUT_S)  # a daemon may have begun to listen in between
     try:
+        # Each call has its own connection, of which the daemon keeps only a few open.
         connection.request("GET", "/status", headers={"Connection": "close"})
         answer = connection.getresponse()
         if answer.status != http.HTTPStatus.OK:

@@ -22,6 +22,7 @@ SETTLED_S = 6.0
 """Time after arming until rates are judged, since they are averaged over five seconds."""
 
 CheckLevel = Literal["good", "unknown", "warning", "bad"]
+# What is not known yet degrades nothing: a run begins with it.
 _RANK = {"good": 0, "unknown": 0, "warning": 1, "bad": 2}
 
 
@@ -30,6 +31,7 @@ def health_of(status: Status, line_rate_hz: float, age_s: float = 0.0) -> Health
     # Without a run, the counts are those of the last one.
     lost = sum(sum(arm.lost.values()) for arm in status.arms.values()) if status.run_id else 0
     checks = [*_of_arms(status, line_rate_hz, age_s), *_of_service(status)]
+    # The first of several equally bad ones is named: those of the arms come before those of the service.
     worst = max((check for check in checks), key=lambda check: _RANK[check.level])
     level: Literal["idle", "good", "degraded", "lost", "fault"]
     if status.state is State.FAULTED:
@@ -51,6 +53,7 @@ def _of_arms(status: Status, line_rate_hz: float, age_s: float) -> list[HealthCh
     found = []
     for name, arm in status.arms.items():
         found += [_ring(name, arm, status.state), _saturation(name, arm), _code(name, arm)]
+        # A rate over five seconds is too low until these have passed.
         if age_s > SETTLED_S:
             found.append(_rate(name, arm, line_rate_hz))
         if arm.ledger is not None and not arm.ledger.balanced:

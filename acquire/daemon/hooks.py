@@ -6,6 +6,7 @@ is given up after a timeout, and later news are sent afterwards, as far as the l
 
 from __future__ import annotations
 
+import http.client
 import logging
 import subprocess
 import threading
@@ -62,6 +63,7 @@ class Hooks:
             found = self._news.after(self._last_id)
             self._last_id = found[-1].id if found else self._last_id
             for news in [one for one in found if self._concerns(one)][-MOST_AT_ONCE:]:
+                # Whoever gets the messages of several rigs must see whose it is.
                 named = news.model_copy(update={"text": f"{self._rig}: {news.text}"})
                 text = named.model_dump_json().encode()
                 if self._config.command:
@@ -99,3 +101,5 @@ class Hooks:
                 return
         except OSError as error:
             log.warning("hook %s: %s", url, error)
+        except http.client.HTTPException as error:  # the port is another service's, or that of https
+            log.warning("hook %s: the answer is not HTTP: %r", url, error)

@@ -110,6 +110,7 @@ def needed_bytes(config: RigConfig) -> tuple[int, int]:
     scene = load_scene(config.scene_file())
     fibre = config.laid_out
     size = config.geometry.stages * config.geometry.substeps if fibre is None else fibre.side
+    # Its scene is finer than its sensor's pixels.
     if scene.optics.layout == "interline":
         size *= scene.optics.baseline_factor
     return rings, SIMULATING * size * size * max(SCENE_BYTES, SCENE_BYTES // 4 * scene.sources)

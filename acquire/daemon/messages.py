@@ -21,6 +21,7 @@ def _on_the_wire(text: object) -> str:
     return visible(text, lines=True)
 
 
+# On the wire only: in this process a text stays what it was.
 Text = Annotated[str, PlainSerializer(_on_the_wire, return_type=str, when_used="json")]
 """Text that is made readable and harmless in JSON, such as a file name that is not UTF-8."""
 Place = Annotated[Path, PlainSerializer(_on_the_wire, return_type=str, when_used="json")]
@@ -87,6 +88,7 @@ class StartRequest(Message):
         description="absolute path of the new recording; absent: named after rig and time in the "
         "configured directory",
     )
+    # Up to 2**53: browsers do not keep larger integers exactly.
     lines: int | None = Field(
         default=None, strict=True, ge=1, le=2**53, description="line budget; absent: until stop"
     )
@@ -137,6 +139,8 @@ class StartRequest(Message):
     @classmethod
     def _can_be_a_name(cls, path: Path | None) -> Path | None:
         text = str(path)
+        # A surrogate stands for a byte of a name that is not UTF-8, and could not be written to a log or an
+        # answer.
         if "\0" in text or text != text.encode(errors="replace").decode():
             raise ValueError(f"path {text!r} is not UTF-8, or has a NUL")
         if path is not None and len(path.name.encode()) > LONGEST_NAME:
@@ -366,6 +370,7 @@ class ErrorMessage(Message):
 
     def rebuild(self) -> AcquireError:
         """Return the error, of its original class if this version knows it."""
+        # The name comes from the other side of the socket: anything but an error of ours is not used.
         known = getattr(errors, self.error, None)
         if not (isinstance(known, type) and issubclass(known, AcquireError)):
             known = AcquireError

@@ -27,6 +27,7 @@ __all__ = ["CONTENT_TYPE", "metrics_text"]
 
 def metrics_text(status: Status, health: Health) -> bytes:
     """Return the metrics in the text format."""
+    # For this one answer. Describing it first, as registries do, would collect everything twice.
     registry = CollectorRegistry(auto_describe=False)
     registry.register(_Metrics(status, health))
     return generate_latest(registry)

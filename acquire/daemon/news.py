@@ -182,7 +182,7 @@ def _waiting(before: Status | None, after: Status) -> list[dict[str, Any]]:
     was, now = bool(before and before.waiting), after.waiting
     if now and not was:
         return [_fact("waiting", now, "warning")]
-    return [_fact("waiting", "what was waited for has answered")] if was and not now else []
+    return [_fact("waiting", "the wait is over")] if was and not now else []
 
 
 def _recoveries(before: Status | None, after: Status) -> list[dict[str, Any]]:

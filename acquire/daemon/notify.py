@@ -9,7 +9,7 @@ import socket
 def notify(message: str) -> bool:
     """Send ``READY=1``, ``STOPPING=1``, ``WATCHDOG=1`` …; return whether it was sent.
 
-    An error is no exception here: a notification that cannot be delivered must not end a measurement.
+    Errors are not raised: a notification that cannot be delivered must not end a measurement.
     """
     address = os.environ.get("NOTIFY_SOCKET", "")
     if not address.startswith(("/", "@")):

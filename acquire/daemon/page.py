@@ -85,6 +85,7 @@ class Page:
             "directory": str(config.recording.directory.absolute()),
             "web": web.model_dump(mode="json"),
         }
+        # As words, and not by the rig file, of which the daemon may have overridden values (--set).
         return [sys.executable, "-m", "acquire", "web", "--owned", "--given", json.dumps(given)]
 
     @property

@@ -62,6 +62,7 @@ class Run:
         configured = self._config.recording.codec
         if configured != "auto":
             return configured
+        # Before `arm` there is none, and nothing that it could pack.
         return self._choice.codec if self._choice else "none"
 
     def arm(self, progress: Callable[[str], object] = lambda _: None) -> None:
@@ -176,6 +177,8 @@ def capture_plan(config: RigConfig, rig: Rig, run_id: str) -> CapturePlan:
         line_period_ns=1e9 / config.passing_hz,
         patience_s=config.recording.patience_s,
         goes_on=config.recording.on_disk_trouble == "continue",
+        # A recorder that makes no progress is not waited for longer than the rig allows, nor than any other
+        # process.
         seal_timeout_s=min(config.recording.seal_timeout_s, END_S),
     )
 
@@ -203,6 +206,7 @@ def default_path(config: RigConfig) -> Path:
     directory = config.recording.directory.absolute()
     path = directory / f"{config.name}-{_stamp()}.zarr"
     number = 2
+    # A link that leads nowhere has the name, too.
     while os.path.lexists(path):
         path = directory / f"{config.name}-{_stamp()}-{number}.zarr"
         number += 1

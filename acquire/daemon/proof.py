@@ -105,6 +105,7 @@ class Proof:
         if best.line_rate_hz >= load.line_rate_hz:
             self._measured = time.monotonic(), best
         else:
+            # Nor is the codec kept, which was chosen under the same disturbance.
             self._chosen = self._measured = None
         return best
 

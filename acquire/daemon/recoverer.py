@@ -99,6 +99,7 @@ def _salvage(mailbox: Mailbox, task: Task) -> RecoveryStatus:
     try:
         refuse_links(path)
         attributes = known_attributes(path)
+        # Only then there is nothing to recover: a recording without a root may still hold all its lines.
         if attributes is None and not shards_on_disk(path):
             return _remove_unborn(task)
         if not task.ours and not is_here(attributes or {}):

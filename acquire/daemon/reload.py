@@ -96,6 +96,7 @@ def _differences(key: str, old: Any, new: Any) -> Iterator[ChangedKey]:
         for name in sorted(old.keys() | new.keys()):
             yield from _differences(f"{key}.{name}".lstrip("."), old.get(name), new.get(name))
     elif old != new:
+        # With the dot, so that `web` allows `web.port` and not `website`.
         holds = next((when for may, when in MAY_CHANGE.items() if f"{key}.".startswith(f"{may}.")), "")
         yield ChangedKey(key=key, old=old, new=new, holds=holds)
 

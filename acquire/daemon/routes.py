@@ -44,6 +44,7 @@ STREAM: dict[int | str, dict[str, Any]] = {
 TEXT: dict[int | str, dict[str, Any]] = {
     200: {"description": "Prometheus text format", "content": {"text/plain": {"schema": {"type": "string"}}}}
 }
+# An answer that a proxy has kept would show an old state as the current one.
 NO_STORE = {"Cache-Control": "no-store"}
 
 
@@ -109,6 +110,7 @@ def _add_commands(router: APIRouter, api: Api, answers: Answers) -> None:
     async def disarm(request_id: RequestId = None) -> Status:
         return await once(request_id, "disarm", api.disarm)
 
+    # These two may be repeated without harm, and need no request ID.
     @router.post("/capacity", summary="idle: measure what ring, codec and disk sustain here, now")
     async def measure() -> CapacityStatus:
         return await api.measure()

@@ -8,8 +8,8 @@
 
 A recording that another process still writes, as the lock of its directory shows, is left to it. Others are
 reported once, in the status and in the log, and not touched: those written by another machine, on a file
-system without locks, or with links, and anything that is no recording. The process ends at once when a run is
-armed, unless it recovers a recording of that run; an interrupted recovery is repeated afterwards.
+system without locks, or with links, and anything that is not a recording. The process ends at once when a
+run is armed, unless it recovers a recording of that run; an interrupted recovery is repeated afterwards.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ MOST_TRIES = 6
 MOST_LISTED = 32
 """Number of latest recordings in the status: more than one run can leave."""
 MOST_ODD = 8
-"""Number of entries of the directory in the status that are no recordings."""
+"""Number of entries of the directory in the status that are not recordings."""
 _END_S = 5.0
 _POLL_S = 0.02
 
@@ -60,6 +60,8 @@ class Salvage:
         self._directory = directory
         self._journal = Journal(journal, "not_sealed", "not sealed")
         self._not_sealed: dict[Path, None] = {}
+        self._begun: set[Path] = set()
+        """Recordings of this daemon's runs that began during the search; their ends are reported."""
         self._tasks: dict[Path, Task] = {}
         self._found: dict[Path, RecoveryStatus] = {}
         self._worker: Worker | None = None
@@ -81,6 +83,8 @@ class Salvage:
 
     def began(self, path: Path) -> None:
         """Note that a run records there, for the next daemon, should this one be killed."""
+        if self._searching is not None:
+            self._begun.add(path)
         if path not in self._not_sealed:
             self._not_sealed[path] = None
             self._journal.write(self._not_sealed)
@@ -108,6 +112,7 @@ class Salvage:
         if self._searching is not None and self._searching.done():
             searching, self._searching = self._searching, None  # taken once, even if it failed
             self._take_search(searching)
+            self._begun.clear()
         ended = self._take_result()
         if capturing and self._under_way is not None and not self._under_way.ours:
             self._cut_off()
@@ -149,6 +154,7 @@ class Salvage:
         except OSError as error:
             log.warning("%s cannot be searched for open recordings: %s", self._directory, error.strerror)
             return
+        # A directory of thousands of other things must neither fill the log nor push the recordings out.
         for one in found.odd[:MOST_ODD]:
             log.warning("%s %s: %s", one.path, one.state, one.text)
             if one.path not in self._found:
@@ -156,10 +162,12 @@ class Salvage:
         if len(found.odd) > MOST_ODD:
             log.warning("%d more like these in %s", len(found.odd) - MOST_ODD, self._directory)
         for path in found.open:
-            if path not in self._found:
+            # A search on a slow disk may meet what a run has begun since: that is not left by anybody.
+            if path not in self._found and path not in self._begun:
                 self._queue(Task(path))
+        # What the journal names and the search met neither open nor odd is sealed by now.
         met = {*found.open, *(one.path for one in found.odd)}
-        for path in [path for path in self._not_sealed if path not in met]:
+        for path in [path for path in self._not_sealed if path not in met and path not in self._begun]:
             self.ended(path)
 
     def _begin(self, *, capturing: bool) -> list[RecoveryStatus]:

@@ -28,6 +28,8 @@ def may_listen(process: Path, socket: Path) -> bool:
         if "serve" not in words or not any(Path(word).name == "acquire" for word in words):
             return False
         given = _socket_of(words, (process / "environ").read_bytes())
+        # By the name alone: a relative path is relative to that process's directory. A wrong guess costs a
+        # wait.
         may_be = given is None or Path(given).name == socket.name
         return may_be and process_age_s(process) < LONGEST_S and not _listens(process)
     except (OSError, ValueError):

@@ -55,14 +55,16 @@ def unit_text(rig: RigConfig, config: Path, *, user: bool, account: str | None =
     """Return the unit for a rig file. ``account``: user of the host's service; None: the current one."""
     recordings = rig.recording.directory.absolute()
     stop_s = round(rig.recording.seal_timeout_s) + STOP_S
-    command = f"{sys.executable} -m acquire serve --config {_quoted(config.absolute())}"
+    python = _quoted(Path(sys.executable))
+    command = f"{python} -m acquire serve --config {_quoted(config.absolute())}"
     who = account or pwd.getpwuid(os.geteuid()).pw_name
     service = [
         "Type=notify",
         "NotifyAccess=main",
         f"ExecStart={command}",
-        f"ExecReload={sys.executable} -m acquire reload{_socket(rig)}",
+        f"ExecReload={python} -m acquire reload{_socket(rig)}",
         *([] if user else [f"User={who}", *_groups(), "RuntimeDirectory=acquire"]),
+        # The directory of `SOCKET`, which is then the default socket of the daemon.
         *([] if user else ["RuntimeDirectoryMode=0700", "Environment=XDG_RUNTIME_DIR=/run/acquire"]),
         f"WorkingDirectory={_quoted(recordings)}",
         f"WatchdogSec={WATCHDOG_S}",
@@ -103,7 +105,7 @@ def _hardening(recordings: Path, rig: RigConfig) -> list[str]:
     """Return settings that deny everything unneeded. (Not MemoryDenyWriteExecute: the simulator compiles.)"""
     writable = {recordings, rig.control.socket.absolute().parent}
     return [
-        "# Where the host's memory ends, others are killed before the capture is; only root may ask for it.",
+        "# If memory runs out, other processes are killed before the capture. Only root may set this.",
         "OOMScoreAdjust=-500",
         "NoNewPrivileges=yes",
         "UMask=0077",

@@ -93,6 +93,7 @@ class Uploads:
         """The latest recordings, of those copied and of those not copied."""
         left = [one for one in self._found.values() if one.state not in _OVER]
         over = [one for one in self._found.values() if one.state in _OVER]
+        # Those that are over are few: `_list` forgets the oldest.
         return [*over, *left[-MOST_LISTED:]]
 
     @property
@@ -130,6 +131,7 @@ class Uploads:
     def recovered(self, path: Path) -> None:
         """Note that a recording is sealed after recovery: copy it if its configuration asks for that."""
         try:
+            # It may have been written by another rig, or before this one named a store: its own root tells.
             wanted = (
                 path in self._found or upload_target(read_root(LocalSource(path))["attributes"]) is not None
             )
@@ -245,13 +247,14 @@ class Uploads:
         return None
 
     def _wait_for_another(self, why: str) -> None:
+        # A process that worked for long is not one that fails at its start.
         if time.monotonic() - self._born_s > MOST_WAIT_S:
             self._deaths = 0
         later_s = wait_s(self._deaths)
         self._deaths += 1
         self._not_before_s = time.monotonic() + later_s
         self.warning = f"the uploading process: {why}"
-        log.error("%s; another takes its place in %g s", self.warning, later_s)
+        log.error("%s; it is replaced in %g s", self.warning, later_s)
 
     def _query(self) -> Reached | None:
         """Return the store's answer, or None if there is none in time."""

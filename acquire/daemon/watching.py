@@ -33,6 +33,7 @@ def watch_plan(config: RigConfig) -> WatchPlan | None:
     if threshold is None and judge is None:
         return None
     passing_hz = config.passing_hz
+    # A check compares what passed over the whole sensor, however slow the lines come.
     lines = max(_LEAST_SENSORS * config.geometry.stages, min(_MOST_LINES, round(_CHECK_S * passing_hz)))
     black_dn = {arm: config.cameras.arm(arm).black_level_dn for arm in ARMS}
     return WatchPlan(judge, lines, black_dn, threshold)

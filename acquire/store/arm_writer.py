@@ -114,6 +114,8 @@ class ArmWriter:
 
     def publish_chunks(self) -> None:
         """Put the written chunks into the indices, as far as the disk allows."""
+        # Each on its own: an array that the disk refuses must not keep the chunks of the others from being
+        # found.
         for array in self._arrays.values():
             with contextlib.suppress(OSError):
                 array.finish()  # a write that has failed leaves nothing to wait for in `publish`
@@ -125,8 +127,9 @@ class ArmWriter:
             array.sync()
 
     def close(self) -> None:
-        for array in self._arrays.values():
-            array.close()
+        with contextlib.ExitStack() as closing:  # one that fails does not keep the others open
+            for array in self._arrays.values():
+                closing.callback(array.close)
 
     def publish(self, publisher: Publisher, rows: int, *, own: bool) -> dict[str, layout.Document]:
         """Return the metadata of ``rows`` rows, by path below the recording.
@@ -139,6 +142,7 @@ class ArmWriter:
         }
         arm = self.directory.name
         group = layout.group_document({"arm": arm, "first_line": self._first_line}, documents)
+        # The arrays' own files before the group's, in the order of the whole recording (`writer`).
         for name, document in (documents | {"": group}).items() if own else ():
             publisher.replace(self.directory / name / "zarr.json", layout.to_json(document))
         return {arm: group} | {f"{arm}/{name}": document for name, document in documents.items()}

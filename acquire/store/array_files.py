@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from acquire.store.layout import Document
     from acquire.store.source import Source
 
+# The type of the samples changes no name.
 COLUMNS = tuple(column.name for column in line_columns("any"))
 """Names of an arm's arrays."""
 

@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from acquire.store.shape import ArrayShape
     from acquire.store.shard import Piece
 
+# Each costs a chunk of memory, and its lines if the process is killed (`spec.durability`).
 ENCODED_AHEAD = 4
 """Number of chunks of an array that may be encoded while others are filled and written."""
 
@@ -102,6 +103,7 @@ class ArrayWriter:
         With ``behind``, a thread, they are lent until `give_back`: large chunks may still be on their way to
         disk, or being encoded.
         """
+        # Small chunks are copied into a piece of their own (`small_piece`), and need not be lent.
         self._behind = behind if self._is_large else None
         start = 0
         while start < len(rows):
@@ -158,9 +160,11 @@ class ArrayWriter:
         size = self.shape.chunk_rows
         if self._pool is None and self._filled == 0:
             self.finish()  # the piece on its way may be in the buffer
+        # Codecs and disk read memory as it lies: rows that are not contiguous go through the buffer.
         if self._filled == 0 and len(rows) >= size and rows.flags.c_contiguous:
             whole = len(rows) // size
             if self._pool is None:
+                # A piece is one write to one file, and ends with it.
                 whole = min(whole, self._with_room().room)
                 self._write(
                     [self._encode(rows[k * size : (k + 1) * size], self._chunks + k) for k in range(whole)]
@@ -228,6 +232,7 @@ class ArrayWriter:
         """Return the shard being written, or the next one if it is full."""
         if self._shard is not None and self._shard.room:
             return self._shard
+        # A full file is settled before it is left: `publish` and `sync` reach only the current one.
         self.publish()
         if self._durable:
             self.sync()

@@ -175,6 +175,7 @@ _ROOT = _record(
         "end_reason": _maybe(_text),
         "layout": _text,
         "first_line": _COUNT,
+        # S is limited by the code of a line, which is one byte.
         "geometry": _record(
             {"stages": _SIZE, "substeps": _whole(1, 8), "pixels": _SIZE}, {"fibre": _maybe(_FIBRE)}
         ),
@@ -182,12 +183,12 @@ _ROOT = _record(
         "clock": _record({"clock_hz": _RATE, "utc_ns_at_tick_0": _SIGNED, "uncertainty_ns": _SIGNED}),
         "code": _object,
         "cameras": _record({"a": _CAMERA, "b": _CAMERA}),
-        "ledger": _record({}, {"a": _book, "b": _book}),
+        "ledger": _record({}, {"a": _book, "b": _book, "tainted_by": _table(_number(0))}),
         "versions": _record({"acquire": _text}),
     },
     {
         "config": _object,
-        "calibration": _maybe(_object),
+        "calibration": _maybe(_record({}, {"steps": _table(_object)})),
         "imported": _maybe(_record({"files": _table(_object), "unknown": _each(_text)})),
         "host": _table(_text),
         "durability": _durability,
@@ -201,7 +202,8 @@ _ROOT = _record(
 
 
 def segment_of(attributes: dict[str, Any]) -> tuple[str, int] | None:
-    """Return the name of the recording that this segment continues, and its number; None if it is none."""
+    """Return the name of the recording that this segment continues, and its number; None if it is not one."""
+    # Checked here: searches for segments read roots that nothing has checked as a whole.
     segment: Any = attributes.get("segment")
     try:
         _SEGMENT(segment)
@@ -212,6 +214,7 @@ def segment_of(attributes: dict[str, Any]) -> tuple[str, int] | None:
 
 def upload_target(attributes: dict[str, Any]) -> str | None:
     """Return the URL to which the rig copies its recordings, according to its configuration, or None."""
+    # Step by step: this reads roots that nothing has checked.
     found: Any = attributes
     for key in ("config", "recording", "upload_to"):
         found = found.get(key) if isinstance(found, dict) else None

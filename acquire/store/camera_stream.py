@@ -56,6 +56,7 @@ class CameraStream(ArmFiles):
     @property
     def line_number(self) -> NDArray[np.uint64]:
         """(line) the trigger's number of each row."""
+        # Not stored: a row's number follows from its place, whatever is missing before it.
         return np.arange(self.first_line, self.first_line + len(self), dtype=np.uint64)
 
     @property
@@ -85,6 +86,7 @@ class CameraStream(ArmFiles):
 
     def array(self, name: str) -> zarr.Array[Any]:
         """Return the Zarr array ``name`` of this arm."""
+        # zarr reads what is not on disk as the fill value, which `read` refuses.
         return child_array(self._group(), f"{self.arm}/{name}")
 
     def reader(self, name: str) -> ChunkReader:

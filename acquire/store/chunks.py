@@ -42,6 +42,8 @@ class ChunkReader(ArrayFiles):
         found, per_shard = {}, self.shape.shard_chunks
         for shard in range(numbers.start // per_shard, -(-numbers.stop // per_shard)):
             entries, intact = self.index(shard)
+            # A torn index may only be in the instant of its replacement: `entry` reads it again when it is
+            # needed.
             for number in numbers if intact else ():
                 offset, size = entries[number % per_shard]
                 if number // per_shard == shard and size <= self.most_bytes and offset < 2**62:
@@ -89,6 +91,7 @@ class ChunkReader(ArrayFiles):
     def trouble(self, number: int) -> str | None:
         """Return what is wrong with a chunk, in words; None if it has the right length and checksum."""
         try:
+            # Not unpacked: the checksum is of the packed bytes.
             self.payload(number, *self.entry(number))
         except (AbsentChunkError, DamagedChunkError) as error:
             return str(error)
@@ -107,6 +110,7 @@ class ChunkReader(ArrayFiles):
         offset, size = entries[number % self.shape.shard_chunks]
         if ABSENT in (offset, size):
             raise AbsentChunkError("it is not on disk")
+        # Larger ones would exhaust the memory, or raise an OverflowError that no reader expects.
         if size > self.most_bytes or offset >= 2**62:
             raise DamagedChunkError("the index of its file is damaged: the chunk would be too large")
         return offset, size

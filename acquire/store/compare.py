@@ -32,6 +32,7 @@ if TYPE_CHECKING:
 
     from acquire.store.reader import Recording
 
+# A recording may be longer than memory.
 BLOCK_ROWS = 16_384
 COLUMNS = ("lines", "code", "flags", "code_index", "tick", "time")
 ROWS = "number of rows"
@@ -150,9 +151,12 @@ def _of_gaps(first: Recording, second: Recording, shift: int, rows: int) -> Iter
     for arm in ARMS:
         old = _edges([*first.lost_rows(arm), *first.dropped_rows()], shift, rows)
         new = _edges(second.lost_rows(arm), 0, rows)
+        # Edges that only one of the two has. They come in pairs, and between those of a pair the two
+        # disagree.
         differing = np.setxor1d(old, new)
         if len(differing):
             row = int(differing[0])
+            # An odd number of edges up to a row: it is inside a lost range.
             words = ("lost", "not lost") if np.searchsorted(old, row, "right") % 2 else ("not lost", "lost")
             count = int((differing[1::2] - differing[::2]).sum())
             yield Difference(f"gaps of arm {arm}", count, row, *words)

@@ -12,7 +12,9 @@ are therefore no group, and are replaced by the next attempt.
 
 from __future__ import annotations
 
+import errno
 import os
+import secrets
 import shutil
 import tempfile
 from contextlib import contextmanager
@@ -28,6 +30,8 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
 
 ROOT = "zarr.json"
+NO_HARD_LINKS = (errno.EPERM, errno.EOPNOTSUPP, errno.ENOSYS)
+"""Errors of `os.link` on a file system without hard links, as memory cards and some network disks have."""
 
 
 class Delivery(Protocol):
@@ -49,7 +53,7 @@ def whole_file(path: Path) -> Iterator[Path]:
     Raises UsageError if ``path`` was created in the meantime, which is left alone, and the errors of
     `refused` if the disk refuses; then nothing is left behind.
     """
-    part = path.with_name(f".{path.name}.{os.getpid()}.partial")
+    part = _partial(path)
     with refused(path, "written"):
         part.open("xb").close()
     try:
@@ -63,8 +67,21 @@ def whole_file(path: Path) -> Iterator[Path]:
                 raise UsageError(
                     f"{path} was created by another program in the meantime", hint="another name"
                 ) from error
+            except OSError as error:
+                if error.errno not in NO_HARD_LINKS:
+                    raise
+                # The next best: what another program creates between these two lines would be replaced.
+                check_new_path(path)
+                part.rename(path)
     finally:
         part.unlink(missing_ok=True)
+
+
+def _partial(path: Path) -> Path:
+    """Return an unused name beside ``path``."""
+    # Not made of the process number: in a container, each run may have the same one as a killed run whose
+    # remains are still there.
+    return path.with_name(f".{path.name}.{secrets.token_hex(4)}.partial")
 
 
 def delivery_to(place: Path | str) -> Delivery:
@@ -84,7 +101,7 @@ class _LocalDelivery:
     def __init__(self, path: Path) -> None:
         check_new_path(path)
         self._path = path
-        self.partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
+        self.partial = _partial(path)
 
     def deliver(self) -> None:
         with refused(self._path, "written"):

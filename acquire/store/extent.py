@@ -24,14 +24,14 @@ def check_lengths(recording: Outline) -> None:
     for key, array in arrays.items():
         # Retention, copies and recovery take the file of the same number of every array for the same lines.
         if array.shape.shard_rows != first.shape.shard_rows:
-            raise ValueError(f"files of {key} have other rows than those of {ARMS[0]}/lines")
+            raise ValueError(f"the files of {key} do not hold the same rows as those of {ARMS[0]}/lines")
         if array.rows > MOST_LINES:
             raise ValueError(f"{key} claims {array.rows} lines")
     # Dropped ranges are parts of the recording, one after the other.
     end = 0
     for rows in sorted(recording.dropped_rows(), key=lambda rows: rows.start):
         if not end <= rows.start < rows.stop <= recording.lines:
-            raise ValueError(f"lines are said to be dropped that are none: rows {rows.start} to {rows.stop}")
+            raise ValueError(f"the dropped rows {rows.start} to {rows.stop - 1} are not in the recording")
         end = rows.stop
     claimed = kept_shards(recording)
     chunks = max(array.shape.shard_chunks for array in arrays.values())

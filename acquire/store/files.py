@@ -58,6 +58,7 @@ def write_all(fd: int, parts: Sequence[Buffer], offset: int) -> None:
     views = [memoryview(part).cast("B") for part in parts]
     left = sum(map(len, views))
     while (written := os.pwritev(fd, views, offset)) < left:
+        # Trying again would never end.
         if written == 0:
             raise OSError(errno.EIO, "the disk takes no more bytes")
         offset += written
@@ -147,6 +148,7 @@ class Disk:
         fd = os.open(path, _NEW, 0o666)
         try:
             write_all(fd, [data], 0)
+            # Its name is forced by whoever gives it its final one (`Publisher.replace`).
             if durable:
                 os.fsync(fd)
         finally:
@@ -269,7 +271,14 @@ def _nameless(directory: Path) -> ShardFile:
 
 def tree_bytes(path: Path) -> int:
     """Return the bytes of all files below ``path``."""
-    return sum(file.stat().st_size for _, files in _walk(path) for file in files if file.is_file())
+    size = 0
+    for _, files in _walk(path):
+        for file in files:
+            # Of a growing recording, commits rename files and retention removes some at any moment.
+            with suppress(FileNotFoundError):
+                found = file.stat()
+                size += found.st_size if stat.S_ISREG(found.st_mode) else 0
+    return size
 
 
 @contextmanager
@@ -309,6 +318,7 @@ def lock(path: Path, doing: str, *, surely: bool = False) -> int:
 
 
 def _walk(path: Path) -> Iterator[tuple[Path, list[Path]]]:
+    # From the bottom up: `sync_tree` forces bytes before the names that lead to them.
     for directory, _, names in os.walk(path, topdown=False):
         base = path.__class__(directory)
         yield base, [base / name for name in names]

@@ -160,6 +160,7 @@ def line_array(column: Column, shape: ArrayShape, rows: int) -> Document:
         "chunk_shape": list(shape.chunk_shape),
         "codecs": [BYTES, *packing(shape), CRC32C],
         "index_codecs": [BYTES, CRC32C],
+        # Where it can be replaced in place while the file grows.
         "index_location": "start",
     }
     return array_document(
@@ -180,6 +181,7 @@ def parse_line_array(document: Document) -> tuple[ArrayShape, int]:
     rows, *row_shape = map(int, document["shape"])
     chunk_rows, *chunk_rest = map(int, inner["chunk_shape"])
     shard_rows, *shard_rest = map(int, document["chunk_grid"]["configuration"]["chunk_shape"])
+    # An array without rows is a valid one; a chunk without rows, or a file without chunks, is not.
     if not row_shape == chunk_rest == shard_rest or min(rows + 1, chunk_rows, shard_rows // chunk_rows) < 1:
         raise ValueError(f"shape {document['shape']} does not fit chunks {inner['chunk_shape']}")
     if inner["index_location"] != "start" or document["data_type"] not in ITEM_BYTES:
@@ -235,6 +237,7 @@ def group_document(attributes: Mapping[str, Any], nodes: Mapping[str, Document])
 
 def to_json(document: Document) -> bytes:
     """Return the bytes of a zarr.json; compact, since it is rewritten at every commit."""
+    # No NaN: Python reads it, but it is not JSON, and other libraries refuse the whole document.
     return json.dumps(document, separators=(",", ":"), allow_nan=False).encode()
 
 

@@ -23,8 +23,8 @@ if TYPE_CHECKING:
 def refuse_links(root: Path) -> None:
     """Raise DataError unless ``root`` and everything below it are directories and regular files.
 
-    A directory without any part of a recording passes: opening it reports that it is none. Raises the error
-    of `refusals.refusal` if the entries cannot be read.
+    A directory without any part of a recording passes: opening it reports that it is not a recording. Raises
+    the error of `refusals.refusal` if the entries cannot be read.
     """
     refuse_link(root, root)
     if not any(os.path.lexists(root / part) for part in ("zarr.json", *ARMS)):
@@ -48,6 +48,7 @@ def refuse_link(root: Path, path: Path) -> None:
     """Raise DataError if ``root``, ``path`` or a directory between them is a link or a special file."""
     below = path.relative_to(root)
     for part in (*reversed(below.parents), below):
+        # What is not there yet, such as the directory of the holds, leads nowhere.
         with refused(root, "read"), suppress(FileNotFoundError, NotADirectoryError):
             mode = os.lstat(root / part).st_mode
             if (kind := kind_of(mode)) is not None and not stat.S_ISDIR(mode):

@@ -32,6 +32,7 @@ def mend_index(disk: Disk, path: Path, reader: ChunkReader, shard: int, *, grow:
     first = shard * len(entries)
     mended = [(ABSENT, ABSENT)] * len(entries)
     for slot, (offset, size) in enumerate(entries):
+        # The chunks of an intact index are checked by the scan, which flags what is lost.
         if intact or _holds(reader, first + slot, offset, size):
             mended[slot] = offset, size
     if grow:
@@ -43,6 +44,7 @@ def mend_index(disk: Disk, path: Path, reader: ChunkReader, shard: int, *, grow:
                 break
             mended[slot] = offset, size
             slot, offset = slot + 1, page_up(offset + size)
+    # Not touched without need: `patch` refuses the read-only and hard-linked files of an archive.
     if intact and mended == entries:
         return False
     disk.patch(path / reader.shard_file(shard), pack_index(mended), 0)

@@ -91,7 +91,7 @@ def mirror(
     has not grown for ``idle_s``: its writer is gone.
     """
     refuse_link(path, path)
-    open_recording(path)  # raises if it is no recording
+    open_recording(path)  # raises if it is not a recording
     with only_copy(path):
         copying = _Steps(Mirror(path, url), progress)
         done = copying.step()
@@ -123,6 +123,7 @@ class _Steps:
     def step(self) -> Mirrored:
         """Copy everything new; see `Mirror.step`."""
         done = self._copying.step(most_shards=1)
+        # One file of lines at a time: after each, the root there names it, and the hold here moves on.
         before = -1
         while not done.sealed and done.shards != before:
             self._progress(done.lines, done.lines + done.waiting_lines)
@@ -176,10 +177,12 @@ class Mirror:
         refuse_links(path)
         self._identity = _identity(open_recording(path).attrs)
         if (there := self.target.path) is not None and os.path.lexists(there):
+            # It would replace the files that are being written by copies of themselves.
             if there.exists() and there.samefile(path):
                 raise UsageError(
                     f"{url} is the recording itself, not a place for its copy", hint="another URL"
                 )
+            # Through a link there, the copy would overwrite something else.
             refuse_links(there)
         self._bytes = 0
         self._shards = 0
@@ -218,6 +221,7 @@ class Mirror:
             refuse_links(self.path)
             self._refuse_shortfall(recording, None)
             self._sealed, self._next = True, 0
+        # Until the recording is sealed, its last file still changes.
         rows = recording.arms[ARMS[0]].reader("lines").shape.shard_rows
         end = -(-recording.lines // rows) if sealed else recording.lines // rows
         try:
@@ -293,8 +297,10 @@ class Mirror:
         foreign = [key for key in self._there if key.split("/")[0] not in _OURS]
         root = self.target.read(ROOT) if ROOT in self._there else b""
         found = _identity_in(root)
+        # A root that cannot be read, beside parts of a recording, was torn by a kill on a store that writes
+        # in place: the copy is not published yet. Alone, it is somebody else's file.
         if found is None and (foreign or (root and len(self._there) == 1)):
-            what = "something damaged" if root else "something that is no recording"
+            what = "something damaged" if root else "something other than a recording"
             raise UsageError(f"{self.target} holds {what}", hint=_ELSEWHERE)
         if found is not None:
             self._root = root
@@ -314,6 +320,7 @@ class Mirror:
         for arm in ARMS:
             for name in COLUMNS:
                 nodes[f"{arm}/{name}"]["shape"][0] = lines
+        # Nothing is deleted from a copy, so that it needs no holds.
         document["attributes"] |= {"dropped": self._dropped(recording, lines), "holds": []}
         root = to_json(document)
         if root == self._root:
@@ -340,6 +347,7 @@ class Mirror:
         found = []
         for rows in recording.dropped_rows():
             at, end = rows.start // size, min(rows.stop, lines) // size
+            # Dropped here, but already there: these are not missing from the copy.
             for shard in [*(shard for shard in there if at <= shard < end), end]:
                 if at < shard:
                     found.append([recording.first_line + at * size, (shard - at) * size])

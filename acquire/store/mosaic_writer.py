@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import ExitStack
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -49,12 +50,15 @@ class MosaicWriter(VideoWriter):
             tile_side=side,
             fill_value=NOT_THERE,
         )
-        self._time_ns, self.frames, self._side = time_ns, len(time_ns), side
-        self._error = np.full((self.frames, tiles[0] * regions, tiles[1] * regions), NOT_THERE, np.float32)
-        self._squares = np.zeros((2, self.frames))
-        # Of its full length from the beginning: a tile may be put whole before the next one has a frame.
-        with refused(place, "written"):
+        with ExitStack() as undo, refused(place, "written"):
+            undo.callback(self._delivery.clear)
+            self._time_ns, self.frames, self._side = time_ns, len(time_ns), side
+            shape_of_errors = (self.frames, tiles[0] * regions, tiles[1] * regions)
+            self._error = np.full(shape_of_errors, NOT_THERE, np.float32)
+            self._squares = np.zeros((2, self.frames))
+            # Of its full length from the beginning: a tile may be put whole before the next one has a frame.
             self._levels[0].resize((self.frames, *shape))
+            undo.pop_all()
 
     def put(
         self,
@@ -96,6 +100,7 @@ class MosaicWriter(VideoWriter):
             for array, values in zip(self._columns.values(), columns, strict=True):
                 array.resize((self.frames, *array.shape[1:]))
                 array[:] = values
+            # In whole chunks of time, each of which is read and written once.
             step = self._levels[0].chunks[0]
             for larger, smaller in zip(self._levels, self._levels[1:], strict=False):
                 smaller.resize((self.frames, *smaller.shape[1:]))

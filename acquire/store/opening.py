@@ -33,7 +33,7 @@ def opened(source: Source, kind: type[Kind]) -> Kind:
     Raises PlaceError if there is no recording, DataError if it is damaged, and StoreError if that cannot be
     found out.
     """
-    # The format comes first: something that is no recording is a wrong path, not damage.
+    # The format comes first: something other than a recording is a wrong path, and not damage.
     document = read_root(source)
     _check_format(source, _format(document))
     try:
@@ -123,6 +123,7 @@ def _check_complete(recording: Outline) -> None:
     code_from_attrs(recording.attrs["code"])
     recording.geometry_for(1)
     for path, node in recording.document["consolidated_metadata"]["metadata"].items():
+        # Files are found by these paths, which must not lead out of the recording.
         if not all(part and part not in (".", "..") and "\0" not in part for part in path.split("/")):
             raise ValueError(f"{path!r} is not the path of an array or a group")
         _check_object(node["attributes"])

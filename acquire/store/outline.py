@@ -80,6 +80,7 @@ class Outline:
     @property
     def lines(self) -> int:
         """Rows of each arm."""
+        # They differ only if the metadata are damaged: then no row counts that an arm lacks.
         return min(len(stream) for stream in self.arms.values())
 
     @property
@@ -156,6 +157,11 @@ class Outline:
     def gaps_not_listed(self) -> int:
         """Number of gaps for which the table had no room."""
         return int(self._nodes["gaps"]["attributes"]["not_listed"])
+
+    @cached_property
+    def events_not_listed(self) -> int:
+        """Number of events for which the table had no room."""
+        return int(self._nodes["events"]["attributes"]["not_listed"])
 
     def geometry_for(self, lines: int) -> Geometry:
         """Return the geometry of a cut of ``lines`` lines."""

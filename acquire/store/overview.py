@@ -59,6 +59,7 @@ class Passing:
 
     def __init__(self, pixels: int) -> None:
         self.step = FIRST_STEP
+        # An even number, since `widen` keeps every second row.
         rows = max(2, min(MOST_ROWS, MOST_SAMPLES // pixels) // 2 * 2)
         # Sums of AVERAGED 16-bit samples fit; the system allocates the memory page by page, on first use.
         self._sums = np.zeros((rows, pixels), np.uint32)
@@ -67,6 +68,7 @@ class Passing:
     def add(self, block: TaggedBlock, first_line: int) -> None:
         """Add the next lines; missing ones are filled with 0."""
         start, count = block.first_line - first_line, len(block.flags)
+        # All of the block's rows must have a place before its first line is added.
         while (start + count - 1) // self.step >= len(self._counts):
             self.widen(2 * self.step)
         for offset in range(AVERAGED):
@@ -98,6 +100,7 @@ def write_overview(
     publisher: Publisher, path: Path, passing: Mapping[str, Passing], spec: RecordingSpec, lines: int
 ) -> dict[str, layout.Document]:
     """Write it for a recording of ``lines`` lines; return the metadata by path. Raises OSError."""
+    # An arm that is ahead may have doubled its T once more.
     step = max(arm.step for arm in passing.values())
     for arm in passing.values():
         arm.widen(step)

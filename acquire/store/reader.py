@@ -130,11 +130,13 @@ class Recording(Outline):
         there, and DataError if the file is damaged or the code recorded with the lines is not the one that
         the attributes describe.
         """
+        # Users know lines by number, and not in which segment an outage has put them.
         if (segment := self._segment_with(first_line)) is not None:
             return segment.cut(first_line, lines, tile)
         start, stop = self._rows(first_line, lines)
         geometry, columns = self.geometry_for(lines), self._columns(tile)
         stretches = self._fetched(start, stop)
+        # Read into their final place, without a copy of all of them.
         samples = np.empty((len(ARMS), lines, geometry.stages), self.arms["a"].dtype)
         for arm, of_arm, those in zip(stretches.values(), samples, columns, strict=True):
             arm["lines"].read(out=of_arm, columns=those)
@@ -262,6 +264,8 @@ class Recording(Outline):
     ) -> NDArray[np.uint8]:
         """Return E of the segment from the attributes, after comparing it with the code stored per line."""
         S, lines = geometry.substeps, geometry.lines
+        # Computed, and only compared with what is stored: the sub-steps of the last lines reach beyond the
+        # end of the recording, and their bits are stored with no line.
         bits = code_from_attrs(self.attrs["code"]).bits(S * first_line, geometry.span)
         index = S * np.arange(first_line, first_line + lines, dtype=np.uint64)
         packed = np.packbits(bits[: S * lines].reshape(lines, S), axis=1, bitorder="little")[:, 0]

@@ -269,10 +269,12 @@ class _Recoverer:
         known = [(gap.arm, gap.first_line, gap.count, gap.cause) for gap in recording.gaps]
         found = [(arm, *gap) for arm, gaps_found in new_gaps.items() for gap in gaps_found]
         for arm, first, count, cause in [*known, *found]:
+            # A gap is listed as a whole: the lines at its end may never have reached the disk.
             kept = min(count, end - first)
             if kept > 0:
                 gaps.add({"first_line": first, "count": kept, "cause": cause, "arm": ARMS.index(arm)})
         gaps.not_listed += recording.gaps_not_listed
+        events.not_listed += recording.events_not_listed
         for event in recording.events:
             events.add({"tick": event.tick, "line": event.line, "kind": event.kind, "text": event.text})
         # A writer that dies between a line's commit and that of its event leaves a line without its mark.

@@ -36,6 +36,7 @@ _STATUS_ERRORS: dict[str, type[OSError]] = {
     "404": FileNotFoundError,
 }
 
+# A metadata service counts only if it is named.
 WAYS_IN = {
     "s3": (
         ("AWS_ACCESS_KEY_ID", "AWS_SECRET_ACCESS_KEY"),
@@ -168,6 +169,7 @@ class RemoteSource:
     def put(self, key: str, data: bytes) -> None:
         """Replace one part by ``data``, in one step in an object store and on a disk of this machine."""
         if self.path is not None:
+            # fsspec would write in place: after a kill, half a file would have the final name.
             put_bytes(self.path / key, data)
             return
         with _as_os_errors():

@@ -98,5 +98,6 @@ def shard_numbers(array: Path) -> list[int]:
         return []
     except OSError as error:
         raise DataError(f"{array} cannot be listed: {error.strerror}") from error
+    # Zarr writes plain decimal numbers: `007`, `²` and numbers beyond 64 bits are names of somebody else's.
     short = (name for name in names if name.isascii() and name.isdecimal() and len(name) < 19)
     return sorted(int(name) for name in short if str(int(name)) == name)

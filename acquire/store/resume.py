@@ -55,6 +55,7 @@ def next_segment(path: Path, spec: RecordingSpec, cause: str = "interrupted") ->
         raise UsageError(f"resuming {path}: it is not sealed", hint=f"acquire recover {last}")
     number = len(segments) + 1
     follows = Continuation(path.name, number, last.first_line + last.lines, last.end_ns(), cause)
+    # In the same directory, since recordings know their segments by name alone.
     place = path.with_name(f"{path.stem}-{number}{path.suffix}")
     return place, replace(spec, run_id=str(first.attrs["run_id"]), continues=follows)
 

@@ -124,7 +124,7 @@ def holds_of(path: Path) -> list[Hold]:
         except FileNotFoundError:
             continue  # replaced by a wider one, or released, in the meantime
         except (*PARSE_ERRORS, OSError) as error:
-            found.append(Hold(0, ALL_LINES, f"{file.name} is no hold, remove it: {error}"))
+            found.append(Hold(0, ALL_LINES, f"{file.name} is not a valid hold, remove it: {error}"))
     return found
 
 
@@ -189,6 +189,7 @@ class Keeper:
         going = []
         age = self.policy.max_age_lines
         for shard in sorted(self.sizes):
+            # What a segment around the newest line needs is kept, even if the disk is nearly full.
             if self._lines(shard).stop > newest - self.policy.margin_lines:
                 break
             if shard in self.odd or self._held(shard, held):

@@ -37,7 +37,7 @@ class Room:
 
 
 class RoomWatch:
-    """Queries the disk of ``path`` now and then; ``reserve_bytes`` of it are to stay free."""
+    """Queries the disk of ``path`` from time to time; ``reserve_bytes`` of it are to stay free."""
 
     def __init__(self, disk: Disk, path: Path, reserve_bytes: int) -> None:
         self._disk = disk
@@ -52,6 +52,7 @@ class RoomWatch:
         """Return the disk's room after ``bytes_written``; queried once per `LOOK_S`. Raises OSError."""
         now = time.monotonic()
         if now >= self._due_s:
+            # Not 0 at the first query, which comes at once.
             elapsed = max(1e-3, now - self._begun_s)
             # An exponential mean, beginning with the first value.
             share = min(1.0, max(LOOK_S, elapsed) / MEMORY_S) if self._bytes else 1.0

@@ -46,6 +46,7 @@ class ArmScan:
             size = self.stream.reader(array).shape.chunk_rows
             for chunk in self.chunks(array, [rows]):
                 if chunk in troubles:
+                    # Chunks of pixels are shorter than those of tags: the two have different borders.
                     lost[max(0, chunk * size - rows.start) : (chunk + 1) * size - rows.start] = True
         return lost
 

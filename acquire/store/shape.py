@@ -100,6 +100,7 @@ def codec_of(codecs: Sequence[dict[str, Any]]) -> Codec:
     names = [codec["name"] for codec in codecs]
     if names == ["bytes", "crc32c"]:
         return "none"
+    # Level and shuffle are in the header of every chunk: for reading, the name is enough.
     if names == ["bytes", "blosc", "crc32c"]:
         for codec in CODECS:
             if codec == codecs[1]["configuration"]["cname"]:

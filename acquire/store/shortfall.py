@@ -1,7 +1,7 @@
 """Recorded lines that are not on disk, found by lengths alone: in a moment, however long a recording is.
 
 `verify` reads every byte. Here only the indices of the files are read and compared with the files' sizes: a
-file that is gone or cut short is detected, a flipped bit is not. Lines flagged as missing are no shortfall:
+file that is gone or cut short is detected, a flipped bit is not. Lines flagged as missing do not count:
 their loss is recorded already.
 """
 
@@ -43,6 +43,7 @@ class Damage:
 
 def shortfalls(recording: Outline, shards: range | None = None) -> Iterator[Damage]:
     """Yield the shortfalls of a recording, or of some shards. Raises DataError if gaps cannot be read."""
+    # Opened with its lines at most once, and only if a file is gone.
     whole = cache(partial(_with_lines, recording))
     for arm, files in recording.arms.items():
         lost = sorted(recording.lost_rows(arm), key=lambda rows: rows.start)

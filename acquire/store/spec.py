@@ -229,6 +229,7 @@ def root_attributes(spec: RecordingSpec, ending: Ending | None = None) -> dict[s
     if spec.continues:  # the length of the outage is known only now, with the first line
         readout = readout_ns(spec, spec.first_line)
         segment = {"segment": spec.continues.to_attrs(spec.first_line, readout)}
+    # The format's own attributes last: nothing may replace them.
     return {**spec.extra, **segment, **_own_attributes(spec, ending)}
 
 

@@ -109,6 +109,7 @@ class Table:
             return
         for column in self._columns:
             place = self.directory / column.name
+            # Without rows there is no chunk, and readers expect none.
             if len(self):
                 # A Zarr chunk has one size: it is filled up to the capacity, and only the length grows.
                 cells = self._cells[column.name]

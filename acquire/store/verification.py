@@ -38,7 +38,7 @@ class Verification:
     bytes : its size
     damage : lines that are not intact on disk
     contradictions : redundant facts that disagree, in words
-    notes : remarks that are no damage
+    notes : remarks that do not report damage
     """
 
     path: str
@@ -78,7 +78,7 @@ def verify(place: Path | str, progress: Callable[[int, int], None] | None = None
         refuse_links(source.path)
     recording = open_source(source)
     scans = scan(recording, recording.kept_rows(), progress)
-    gone = open_source(source).dropped  # lines that retention deleted during the scan are no damage
+    gone = open_source(source).dropped  # lines that retention deleted during the scan are not damaged
     damage = tuple(
         found
         for arm in scans.values()
@@ -102,6 +102,7 @@ def _contradictions(recording: Recording, scans: dict[str, ArmScan]) -> Iterator
     try:
         listed = {arm: _listed(recording, arm) for arm in ARMS}
         complete = recording.gaps_not_listed == 0
+        # The tables are read here once, so that a damaged one is a contradiction and no failure of `verify`.
         recording.events  # noqa: B018 - reads the table
     except DataError as error:
         yield error.message
@@ -177,6 +178,7 @@ def _metadata(recording: Recording) -> Iterator[str]:
         except DAMAGE as error:
             yield f"{path}/zarr.json cannot be read: {error}"
             continue
+        # Nodes in the root have no consolidated metadata of their own; the files of the groups have.
         if any(own.get(key) != value for key, value in document.items() if key != "consolidated_metadata"):
             yield f"{path}/zarr.json differs from its copy in the root"
 

@@ -190,8 +190,30 @@ def open_video(place: Path | str) -> VideoFile:
         time_ns = np.asarray(child_array(group, "time")[:], np.int64)
         quality = np.asarray(child_array(group, "quality")[:]) if "quality" in group else None
         error = child_array(group, "error") if "error" in group else None
-        return VideoFile(child_array(group, "0"), time_ns, attributes, quality, error)
+        found = VideoFile(child_array(group, "0"), time_ns, attributes, quality, error)
+        _check(found)
     except (GroupNotFoundError, NotADirectoryError) as error:
         raise PlaceError(f"{source} is not a video: it is not a Zarr group", hint=_VIDEO) from error
     except DAMAGE as error:
         raise DataError(f"{source} is not a video, or is damaged: {error}") from error
+    return found
+
+
+def _check(found: VideoFile) -> None:
+    """Check everything that is read from the attributes; raise one of `DAMAGE` if it is impossible."""
+    # Once, here: whoever shows or exports a video relies on its attributes.
+    frames = found.video.shape[0]
+    if found.video.ndim != 3 or len(found.time_ns) != frames:
+        raise ValueError(f"it has {len(found.time_ns)} times for a video of {found.video.shape}")
+    if not all(math.isfinite(step) and step > 0 for step in found.scale):
+        raise ValueError(f"its scale is {found.scale}")
+    if not all(map(math.isfinite, found.origin)):
+        raise ValueError(f"its origin is {found.origin}")
+    found.pixel_unit  # noqa: B018 - reads the axes
+    found.trusted  # noqa: B018 - reads the provenance
+    provenance = found.attrs.get("provenance") or {}
+    if not isinstance(provenance.get("error") or {}, dict):
+        raise TypeError("its error is not a JSON object")
+    segments = provenance.get("segments") or []
+    if not (isinstance(segments, list) and all(isinstance(one, dict) for one in segments)):
+        raise TypeError("its segments are not a list of JSON objects")

@@ -40,8 +40,8 @@ QUALITY_ATTRIBUTES: dict[str, Any] = {
 
 ERROR_ATTRIBUTES: dict[str, Any] = {
     "long_name": "estimated RMS error of the voxels of a region of the frame",
-    "comment": "in the unit of the video; NaN where it cannot be told; rows and columns in equal parts; "
-    "provenance, error, says how sure it is; frames that are not trusted are worse than it says",
+    "comment": "in the unit of the video; NaN if no estimate is possible; the regions divide rows and "
+    "columns equally; its uncertainty is in provenance.error; untrusted frames have a larger error",
 }
 
 TRUSTED_ATTRIBUTES: dict[str, Any] = {
@@ -65,6 +65,7 @@ class VideoGrid:
         """Return the grid of a level whose pixels are 2^number wide."""
         factor = 2**number
         (t, height, width), (begin, y, x) = self.step, self.origin
+        # The centre of a larger pixel is in the middle of those that it stands for.
         origin = (begin, y + (factor - 1) * height / 2, x + (factor - 1) * width / 2)
         return VideoGrid((t, factor * height, factor * width), origin, self.pixel_unit)
 
@@ -98,17 +99,20 @@ class Window:
 
     def add(self, frames: NDArray[Any]) -> None:
         """Take frames into account; memory stays bounded, however many come."""
+        # Voxels of tiles that were not written are NaN (`mosaic_writer`).
         finite = frames[np.isfinite(frames)] if frames.dtype.kind == "f" else frames.reshape(-1)
         if not finite.size:
             return
         self.low, self.high = min(self.low, float(finite.min())), max(self.high, float(finite.max()))
         self._kept.append(finite[:: max(self._every, finite.size // KEPT)].copy())
         while sum(map(len, self._kept)) > 2 * KEPT:
+            # Of later frames as few are taken, so that all count alike.
             self._every *= 2
             self._kept = [np.concatenate(self._kept)[::2]]
 
     def to_omero(self, name: str, first_frame: int) -> dict[str, Any]:
         """Return the attribute ``omero``; ``first_frame`` is shown first."""
+        # A video without any finite voxel gets some window: viewers expect one.
         values = np.concatenate(self._kept) if self._kept else np.zeros(1)
         start, end = (float(each) for each in np.quantile(values, (LOW, HIGH)))
         low, high = (self.low, self.high) if self._kept else (0.0, 1.0)
@@ -159,4 +163,5 @@ def along(axis: str, grid: VideoGrid, count: int) -> NDArray[np.float64]:
 
 def coordinates_of(columns: Sequence[str]) -> str:
     """Return the names that xarray takes as coordinates of the image, in addition to its axes."""
+    # `error` has axes of its own.
     return " ".join(name for name in columns if name not in {"t", "y", "x", "error"})

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from contextlib import ExitStack
 from pathlib import PurePosixPath
 from typing import TYPE_CHECKING, Any, Self
 
@@ -57,7 +58,9 @@ class VideoWriter:
         self._place, self._delivery, self._grid = place, delivery_to(place), grid
         self._name = PurePosixPath(str(place)).stem
         self._window, self._begin_ns = layout.Window(), 0
-        with refused(place, "written"):
+        # Until this has returned there is no ``with`` block that would remove what a full disk leaves.
+        with ExitStack() as undo, refused(place, "written"):
+            undo.callback(self._delivery.clear)
             self._group = zarr.create_group(self._delivery.partial, zarr_format=3)
             chunk = shape if tile_side is None else (tile_side, tile_side)
             frames = max(1, CHUNK_BYTES // (chunk[0] * chunk[1] * dtype.itemsize))
@@ -84,6 +87,7 @@ class VideoWriter:
                 self._columns["error"] = _of_regions(self._group, regions)
             for axis, count in zip("yx", shape, strict=True):
                 _whole(self._group, axis, layout.along(axis, grid, count), axis, grid)
+            undo.pop_all()
         self._chunk: list[tuple[NDArray[Any], ...]] = []
         self.frames = 0
 

@@ -17,7 +17,7 @@ import json
 import os
 import time
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Self
 
@@ -216,7 +216,9 @@ class RecordingWriter:
         self._check_alive()
         with self._failing(f"writing lines of arm {block.arm}"):
             self._arms[block.arm].append(block, behind)
+        # After the arrays, which refuse a block that does not fit.
         self._overview[block.arm].add(block, self.spec.first_line)
+        # Of both arms, so that an arm that is ahead does not cause commits without a new row.
         written = min(arm.written_rows for arm in self._arms.values())
         if written - self._committed >= self.spec.commit_lines:
             self.commit()
@@ -273,10 +275,13 @@ class RecordingWriter:
                 self._own_due_s = time.monotonic() + OWN_INTERVAL_S
             nodes = self._publish_parts(rows, own=own)
             # The lines that retention drops are not committed any more; only then are their files deleted.
+            # A new object is a new query: a shortage is made up for once, and not again at each commit until
+            # the next.
             looked, self._looked = self._looked is not room, room
             going = self._keeper.choose(rows, -room.free_bytes if looked else 0) if self._keeper else []
             if looked:
                 self._stuck = room.full and not going
+            # Before the root, so that one that is rebuilt from the copy never claims lines that are deleted.
             if going:
                 self._publish_copy()
             self._publish_root(rows, nodes)
@@ -347,13 +352,14 @@ class RecordingWriter:
         for threads in (self._pool, self._behind):
             if threads is not None:
                 threads.shutdown(cancel_futures=True)
-        with self._failing("closing files"):
-            for arm in self._arms.values():
-                arm.close()
-            # The lock last: whoever gets it may recover the recording, which must not be written any more.
+        # From the last callback to the first, even if some fail. The lock last: whoever gets it may recover
+        # the recording, which must not be written any more.
+        with self._failing("closing files"), ExitStack() as closing:
             if self._lock >= 0:
-                held, self._lock = self._lock, -1
-                os.close(held)
+                closing.callback(os.close, self._lock)
+                self._lock = -1
+            for arm in self._arms.values():
+                closing.callback(arm.close)
 
     @property
     def _durable(self) -> bool:

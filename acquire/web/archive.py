@@ -107,6 +107,7 @@ class Archive:
         """Return a PNG of both arms, with time downwards. Raises PlaceError and DataError."""
         path = self.path_of(name)
         opened = open_recording(path)
+        # A recording that grows has another picture, and so has another one of the same name.
         key = (name, opened.state, opened.lines, opened.attrs.get("run_id"))
         if key not in self._pictures:
             parts = [_arm_overview(opened, arm) for arm in ARMS]
@@ -149,6 +150,7 @@ class Archive:
         if not 0 <= first < facts.frames:
             raise UsageError(f"{name} has no frame {first}", possible=f"0 to {facts.frames - 1}")
         values = np.asarray(video.video[first : first + min(count, most)], np.float32)
+        # Voxels of tiles that were not written are NaN, and shown black.
         scaled = np.nan_to_num((values - facts.low) * (255 / max(facts.high - facts.low, 1e-12)))
         content: bytes = np.clip(scaled, 0, 255).astype(np.uint8).tobytes()
         return content

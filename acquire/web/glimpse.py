@@ -156,6 +156,7 @@ def glimpse_message(
 
 def glimpses(client: Client, is_over: Callable[[], bool]) -> Iterator[bytes]:
     """Yield messages until ``is_over``; b"" if there are no lines to show now."""
+    # By way of JSON, since the models are strict: a list is no tuple to them, but in JSON it is.
     config = RigConfig.model_validate_json(json.dumps(client.setup().config))
     while not is_over():
         rings = client.rings()

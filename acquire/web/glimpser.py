@@ -49,7 +49,10 @@ class Glimpser:
             while not self._watchers:
                 self._changed.clear()
                 await self._changed.wait()
-            await self._run_process()
+            try:
+                await self._run_process()
+            except OSError as error:  # no process can be started now: the host is out of memory or numbers
+                log.warning("no glimpses: their process cannot be started: %s", error)
             if self._watchers:
                 await asyncio.sleep(AGAIN_S)
 

@@ -85,6 +85,7 @@ class Hub:
         if not self.connected or self.status is None:
             return message({"type": "link", "connected": False, "why": self.why})
         status, health = self.status.model_dump_json(), self.health().model_dump_json()
+        # The browser's own clock may be wrong: how old a state is follows from ours.
         facts = f'{{"now_ms":{time.time_ns() // 1_000_000},"status":{status},"health":{health}}}'
         return json_message("state", facts)
 
@@ -113,6 +114,7 @@ class Hub:
         # On every connection, since a daemon that was started anew may have another rig.
         self.setup = await self.client.setup()
         async for item in self.client.follow(reader, history=True, status_s=STATUS_S):
+            # Any message counts, not only a status: see `_watch`.
             self._heard_s = time.monotonic()
             if isinstance(item, News):
                 self._news.append((self._count, json_message("news", item.model_dump_json())))

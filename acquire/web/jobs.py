@@ -25,6 +25,7 @@ from acquire.errors import AcquireError, PlaceError, StateError
 from acquire.web.calibrations import step_of
 from acquire.web.job_words import calibration_words, free_name, progress_facts, recording_words
 from acquire.web.messages import CalibrationRequest, JobFacts, JobRequest
+from acquire.web.worker import OWNER
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -168,7 +169,8 @@ class Jobs:
             "acquire.web.worker",
             *words,
             cwd=self._directory,
-            env=os.environ | {"ACQUIRE_SOCKET": str(self._socket), "ACQUIRE_BY": job.by},
+            env=os.environ
+            | {"ACQUIRE_SOCKET": str(self._socket), "ACQUIRE_BY": job.by, OWNER: str(os.getpid())},
             stdin=asyncio.subprocess.DEVNULL,
             stdout=asyncio.subprocess.DEVNULL,
             stderr=asyncio.subprocess.PIPE,
@@ -201,11 +203,18 @@ async def _follow_progress(job: _Job) -> None:
     """Copy a job's progress reports into its facts, until it closes its standard error."""
     assert job.process is not None
     assert job.process.stderr is not None
-    with contextlib.suppress(ValueError):  # raised for a line that is too long; the rest is then ignored
-        async for line in job.process.stderr:
-            # Once it is being stopped, the text that says so stays.
-            if job.ending is None:
-                job.update(**progress_facts(line.decode(errors="replace")))
+    while True:
+        try:
+            line = await job.process.stderr.readline()
+        except ValueError:
+            # A part of a line that is too long is dropped. Reading goes on: a process whose pipe is full
+            # waits for ever, and so would its job and all that are queued behind it.
+            continue
+        if not line:
+            return
+        # Once it is being stopped, the text that says so stays.
+        if job.ending is None:
+            job.update(**progress_facts(line.decode(errors="replace")))
 
 
 async def _stop_process(job: _Job) -> None:

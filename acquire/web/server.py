@@ -26,6 +26,7 @@ if TYPE_CHECKING:
 NICE = 10
 IDLE_S = 5
 GRACE_S = 1
+# More than the open pages can hold (`page_stream.MOST_PAGES`), which leaves some for their other requests.
 MOST_CONNECTIONS = 64
 
 log = logging.getLogger("acquire.web")

@@ -16,6 +16,8 @@ from acquire.processes.rank import FIRST, stand_back
 
 _NICE = 19
 _PR_SET_PDEATHSIG = 1
+OWNER = "ACQUIRE_OWNER"
+"""Environment variable with the process number of the page; absent: whoever has started this process."""
 
 
 def main() -> None:
@@ -23,6 +25,9 @@ def main() -> None:
     # The page may be killed, and then nobody else ends its jobs.
     final_signal = signal.SIGINT if sys.argv[1] == "calibrate" else signal.SIGKILL
     ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, final_signal, 0, 0, 0)  # holds beyond execv
+    # Its death before this call is not reported any more, but has given this process another parent.
+    if os.getppid() != int(os.environ.get(OWNER, os.getppid())):
+        return
     os.execv(sys.executable, [sys.executable, "-m", "acquire", *sys.argv[1:]])  # noqa: S606 - ourselves
 
 

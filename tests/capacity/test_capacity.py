@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import replace
 from pathlib import Path
 
@@ -49,6 +50,15 @@ def test_the_remains_of_a_killed_measurement_are_removed(tmp_path: Path) -> None
     measure_parts(SMALL, tmp_path)
     run_load(SMALL, tmp_path, 0.1)
     assert {path.name for path in tmp_path.iterdir()} == {".capacity-1.zarr", ".load-1.zarr"}
+
+
+def test_the_remains_of_a_killed_daemon_with_this_process_number_are_removed(tmp_path: Path) -> None:
+    """In a container the daemon has the same number after every start."""
+    for kind in ("capacity", "load"):
+        (tmp_path / f".{kind}-{os.getpid()}.zarr" / "a").mkdir(parents=True)
+    measure_parts(SMALL, tmp_path)
+    run_load(SMALL, tmp_path, 0.1)
+    assert not any(tmp_path.iterdir())
 
 
 def test_processors_are_shared_by_all_parts() -> None:

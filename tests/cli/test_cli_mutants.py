@@ -126,6 +126,8 @@ MUTANTS: dict[str, Change] = {
                 {"stored": 1, "missing": 5},
                 {"stored": 1, "missing": {"x": "y"}},
             ),
+            "ledger.tainted_by": (5, {"incomplete_a": "x"}),
+            "calibration": (5, {"steps": 5}, {"steps": {"dark": 3}}),
             "code.degree": (10**9, "x", None),
             "code.state": ("x", [], 10**30),
             "code.seed": ("x", []),

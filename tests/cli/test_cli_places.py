@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import socket
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +13,11 @@ import pytest
 import zarr
 from s3_server import KEYS, S3Server
 
+from acquire.cli.demo import capture
+from acquire.cli.demo.plan import DemoPlan
+from acquire.cli.journal import Journal
 from acquire.cli.usage import not_installed
+from acquire.errors import NoDaemonError
 from acquire.store import write_video
 from acquire.store.remote import WAYS_IN, RemoteSource
 
@@ -234,3 +239,25 @@ def test_a_missing_package_is_named_with_the_extra_that_installs_it(
     error = not_installed(ModuleNotFoundError(f"No module named {module!r}", name=module))
     assert (error.exit_code, error.hint.replace("'", "")) == (2, f"pip install {brought}")
     assert module in error.message
+
+
+def test_a_demo_has_a_socket_wherever_temporary_files_go(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    deep = tmp_path / ("x" * 100)
+    deep.mkdir()
+    monkeypatch.setattr("tempfile.tempdir", str(deep))
+    asked: list[Path] = []
+
+    @contextmanager
+    def no_daemon(_: DemoPlan, path: Path) -> Iterator[None]:
+        with socket.socket(socket.AF_UNIX) as listener:
+            listener.bind(str(path))  # raises for a path that is too long
+        asked.append(path)
+        raise NoDaemonError("enough")
+        yield
+
+    monkeypatch.setattr(capture, "daemon", no_daemon)
+    with pytest.raises(NoDaemonError, match="enough"):
+        capture.record(DemoPlan(tmp_path), Journal())
+    assert not asked[0].parent.exists()

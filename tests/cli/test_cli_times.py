@@ -12,6 +12,7 @@ import typer
 
 from acquire.cli.durations import parse_duration_ns, seconds, seconds_between
 from acquire.cli.moments import after_ns, line_number
+from acquire.cli.reconstruct_request import parse_segment, parse_voxels
 from acquire.cli.usage import build
 from acquire.config import load_rig, load_scene
 from acquire.errors import UsageError
@@ -81,6 +82,23 @@ def test_moments() -> None:
     assert line_number("l7") == 7
     with pytest.raises(UsageError, match="a video has frames"):
         after_ns("L20", lambda: 0)
+
+
+@pytest.mark.parametrize(
+    "parse",
+    [
+        lambda digits: after_ns(f"L{digits}", lambda: 0, lambda line: line),
+        lambda digits: parse_voxels(f"{digits}x1"),
+        lambda digits: parse_segment(f"{digits}:3x4"),
+        lambda _: parse_segment("²:3x4"),
+    ],
+)
+@pytest.mark.parametrize("count", [400, 5000])
+def test_what_no_number_can_be_made_of_is_refused_in_words(
+    parse: Callable[[str], object], count: int
+) -> None:
+    with pytest.raises(UsageError, match="cannot be read"):
+        parse("9" * count)
 
 
 @pytest.mark.parametrize(

@@ -50,3 +50,18 @@ def test_a_command_ends_the_automatic_ones(tmp_path: Path) -> None:
     asyncio.run(begin(service.config.service, service, carry_out))
     assert run.names == ["arm", "start", "close"]
     assert service.status().state is State.IDLE
+
+
+def test_a_defect_is_listed_and_tried_again(tmp_path: Path) -> None:
+    run = FakeRun(arm=OSError("No space left on device"))
+    service = service_of(run, tmp_path)
+
+    async def carry_out(command: Callable[[], None]) -> None:
+        if run.names.count("arm") == 2:
+            run.refuse.clear()
+        command()
+
+    asyncio.run(begin(service.config.service, service, carry_out))
+    assert run.names == ["arm", "arm", "arm", "start"]
+    assert [one.times for one in service.status().troubles] == [2]
+    assert service.status().state is State.RECORDING

@@ -60,7 +60,7 @@ def test_memory_is_held_against_the_rings(tmp_path: Path, monkeypatch: pytest.Mo
 
 def test_the_disk_is_looked_at(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert found(rig_config(tmp_path), "disk").level in ("good", "warning")
-    assert "no directory" in found(rig_config(tmp_path / "none"), "disk").text
+    assert "not a directory" in found(rig_config(tmp_path / "none"), "disk").text
     monkeypatch.setattr(doctor, "_file_system", lambda _: "nfs4")
     assert "waits for a network" in found(rig_config(tmp_path), "disk").text
 

@@ -137,7 +137,7 @@ def test_waiting_is_told_when_it_begins_and_ends() -> None:
     assert changes.of(status()) == []
     assert [one["kind"] for one in changes.of(status(waiting="the disk, for 2 s"))] == ["waiting"]
     assert changes.of(status(waiting="the disk, for 3 s")) == []
-    assert [one["text"] for one in changes.of(status())] == ["what was waited for has answered"]
+    assert [one["text"] for one in changes.of(status())] == ["the wait is over"]
 
 
 def test_what_was_told_is_not_told_again_when_a_run_begins() -> None:

@@ -6,6 +6,7 @@ import configparser
 import http.server
 import json
 import re
+import socket
 import subprocess
 import sys
 import threading
@@ -91,6 +92,22 @@ def test_a_webhook_gets_json() -> None:
     assert json.loads(bodies[0])["text"] == "rig: the disk is full in 2 min"
 
 
+def test_a_server_that_does_not_speak_http_ends_no_notifications(caplog: pytest.LogCaptureFixture) -> None:
+    """As on a port of another service, or of https."""
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        server.settimeout(300)
+        log = NewsLog()
+        hooks = Hooks(HooksConfig(webhook=f"http://127.0.0.1:{server.getsockname()[1]}/x"), log, "rig")
+        for _ in range(2):
+            log.add("loss", "x", level="error")
+            connection, _ = server.accept()
+            with connection:
+                connection.recv(2**16)
+                connection.sendall(b"SSH-2.0-x\r\n")
+        hooks.close()
+    assert caplog.text.count("BadStatusLine") == 2
+
+
 @pytest.mark.parametrize("url", ["ftp://x", "http://", "http://user:secret@host/"])
 def test_webhooks_that_cannot_be_are_refused(url: str) -> None:
     with pytest.raises(ConfigError, match=r"hooks\.webhook"):
@@ -117,6 +134,15 @@ def test_the_unit_says_when_it_is_ready_and_what_it_may_not(tmp_path: Path) -> N
     assert rings + scene < int(unit["MemoryLow"].removesuffix("M")) * 1e6 < memory_bytes()
     assert unit["NoNewPrivileges"] == "yes"
     assert "User" not in unit_of(tmp_path, user=True)
+
+
+def test_the_unit_names_a_python_whose_path_has_a_space(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sys, "executable", "/home/my user/.venv/bin/python")
+    unit = unit_of(tmp_path, user=True)
+    for key in ("ExecStart", "ExecReload"):
+        assert unit[key].startswith('"/home/my user/.venv/bin/python" -m acquire ')
 
 
 @pytest.mark.skipif(

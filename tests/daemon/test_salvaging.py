@@ -19,7 +19,7 @@ from acquire.daemon.journal import Journal
 from acquire.daemon.messages import RecoveryStatus
 from acquire.daemon.salvage import MOST_ODD, Salvage
 from acquire.lines import ARMS, LineBlock
-from acquire.store import RecordingWriter, open_recording
+from acquire.store import RecordingWriter, RunCondition, open_recording
 from acquire.store.files import locked
 from acquire.stream import Note, Orphan
 from acquire.stream.tagger import Tagger
@@ -77,6 +77,24 @@ def test_while_a_run_captures_only_what_it_left_is_recovered(salvage: Salvage, t
     assert open_recording(found).state == "sealed"
     salvage.add([Orphan(ours, "its recorder was killed")])  # the status goes on telling it
     assert salvage.wait(WAIT_S) == []
+
+
+def test_a_late_search_does_not_take_what_is_being_recorded_for_something_left(
+    salvage: Salvage, tmp_path: Path
+) -> None:
+    """On a slow disk, the first run may begin before the search has ended."""
+    path = tmp_path / "run.zarr"
+    with RecordingWriter.create(path, SPEC) as writer:
+        salvage.search()
+        salvage.began(path)
+        assert salvage._searching is not None
+        salvage._searching.result(WAIT_S)
+        assert salvage.poll(capturing=True) == []
+        assert salvage.recoveries == []
+        writer.seal(RunCondition.GOOD, "stopped", {})
+    salvage.ended(path)
+    assert salvage.poll() == []
+    assert salvage.recoveries == []
 
 
 def test_what_had_not_begun_is_removed(salvage: Salvage, tmp_path: Path) -> None:

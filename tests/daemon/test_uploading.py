@@ -223,7 +223,7 @@ def test_a_process_that_is_killed_is_replaced(place: Place, caplog: pytest.LogCa
     os.kill(uploads._worker.pid, signal.SIGKILL)
     uploads.add(place.write("x.zarr"))
     look_until(uploads, lambda: states(uploads) == {"x.zarr": "copied"})
-    assert "killed by SIGKILL; another takes its place" in caplog.text
+    assert "killed by SIGKILL; it is replaced" in caplog.text
 
 
 def test_waits_grow_and_are_bounded() -> None:

@@ -109,7 +109,7 @@ def test_the_estimated_error_of_a_video_is_exported(cli: Cli, told: Path, tmp_pa
         images = tifffile.xml2dict(file.ome_metadata)["OME"]["Image"]
         assert [image["Name"] for image in images] == [str(told), "error"]
         assert json.loads(images[0]["Description"])["estimated_error"] == IN_WORDS
-        assert "NaN where it cannot be told" in images[1]["Description"]
+        assert "NaN if no estimate is possible" in images[1]["Description"]
     with h5py.File(tmp_path / "v.h5") as file:
         data, beside = file["entry/data"], file["entry/error"]
         np.testing.assert_array_equal(beside[beside.attrs["signal"]], error)

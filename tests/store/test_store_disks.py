@@ -28,6 +28,8 @@ from acquire.store import (
     recover,
     verify,
 )
+from acquire.store.array_writer import ArrayWriter
+from acquire.store.delivery import whole_file
 from acquire.store.files import Disk, ShardFile
 from acquire.store.pages import PAGE, aligned_bytes, is_aligned, open_direct
 from acquire.store.shape import CODECS
@@ -349,3 +351,58 @@ def test_what_somebody_else_removes_meanwhile_need_not_be_forced(tmp_path, monke
     monkeypatch.setattr(files, "_sync", sync)
     files.DISK.sync_tree(tmp_path)
     assert {tmp_path / "chunk", tmp_path / "holds", tmp_path} <= set(forced)
+
+
+@pytest.mark.parametrize("number", [errno.EPERM, errno.EOPNOTSUPP, errno.ENOSYS])
+def test_a_file_is_delivered_where_there_are_no_hard_links(tmp_path, monkeypatch, number):
+    """As to a memory card: exFAT refuses links with EPERM."""
+
+    def refuse(*_):
+        raise OSError(number, os.strerror(number))
+
+    monkeypatch.setattr(os, "link", refuse)
+    with whole_file(tmp_path / "cut.npz") as part:
+        part.write_bytes(b"lines")
+    assert [path.name for path in tmp_path.iterdir()] == ["cut.npz"]
+    assert (tmp_path / "cut.npz").read_bytes() == b"lines"
+    with pytest.raises(UsageError, match="exists already"), whole_file(tmp_path / "cut.npz") as part:
+        part.write_bytes(b"others")
+    assert [path.name for path in tmp_path.iterdir()] == ["cut.npz"]
+    assert (tmp_path / "cut.npz").read_bytes() == b"lines"
+
+
+def test_a_file_that_vanishes_while_sizes_are_added_up_counts_nothing(tmp_path, monkeypatch):
+    """As the scratch file of a recording's metadata, ten times a second."""
+    (tmp_path / "zarr.json").write_bytes(b"root")
+    (tmp_path / ".next").write_bytes(b"x")
+    really = Path.stat
+
+    def stat(path, **how):
+        found = really(path, **how)
+        if path.name == ".next":
+            path.unlink()
+        return found
+
+    monkeypatch.setattr(Path, "stat", stat)
+    assert files.tree_bytes(tmp_path) in (4, 5)
+
+
+def test_a_file_that_cannot_be_closed_keeps_neither_the_others_nor_the_lock(path, monkeypatch):
+    """As on a network disk, which may report a failed write only then."""
+    writer = RecordingWriter.create(path, make_spec(codec="none"))
+    fill(writer, 40)
+    really, closed = ArrayWriter.close, []
+
+    def close(array):
+        really(array)
+        closed.append(array)
+        if len(closed) == 1:
+            raise OSError(errno.EIO, os.strerror(errno.EIO))
+
+    monkeypatch.setattr(ArrayWriter, "close", close)
+    with pytest.raises(DataError, match="the disk failed while closing files"):
+        writer.close()
+    assert len(closed) == 12
+    with files.locked(path, "reading"):
+        pass
+    writer.close()

@@ -237,8 +237,8 @@ def test_a_file_that_is_no_hold_holds_everything_and_is_named(path, text):
         (path / "a" / "lines" / ".holds" / "1-2.json").write_text(text)
         grow(writer, 6 * SHARD)
         assert left(path) == list(range(4, 12))
-        (why,) = [why for _, _, why in open_recording(path).attrs["holds"] if "no hold" in why]
-        assert "1-2.json is no hold, remove it" in why
+        (why,) = [why for _, _, why in open_recording(path).attrs["holds"] if "not a valid hold" in why]
+        assert "1-2.json is not a valid hold, remove it" in why
         (path / "a" / "lines" / ".holds" / "1-2.json").unlink()
         grow(writer, SHARD)
         assert left(path)[0] == 8 - 1

@@ -17,6 +17,7 @@ from acquire.store import Circumstances, Gap, RecordingWriter, RunCondition, ope
 from acquire.store.host import has_run_on, is_here
 from acquire.store.pages import PAGE
 from acquire.store.removal import COPY
+from acquire.store.table import EVENT_ROWS
 
 SPEC = make_spec(codec="none")
 ARRAYS = ("lines", "code_index", "code", "tick", "time", "flags")
@@ -237,6 +238,18 @@ def test_what_a_commit_did_not_list_is_added(path):
     assert recording.events[-1].kind == "recovered"
     assert [file.name for file in path.rglob(".*")] == [COPY]
     assert verify(path).intact
+
+
+def test_events_that_found_no_room_are_counted_after_a_recovery_as_well(path):
+    writer = RecordingWriter.create(path, SPEC)
+    for number in range(EVENT_ROWS + 3):
+        writer.add_event("mark", number, 1000, "x")
+    fill(writer, 40)
+    writer.commit()
+    writer.close()
+    recover(path)
+    events = zarr.open_group(path, mode="r")["events"]
+    assert (events["kind"].shape, events.attrs["not_listed"]) == ((EVENT_ROWS,), 4)  # and its own
 
 
 def test_what_is_not_a_recording_cannot_be_verified_or_recovered(tmp_path):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 import shutil
@@ -15,8 +16,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from ome_zarr_models.common.omero import Omero
 
-from acquire.errors import DataError, PlaceError, UsageError
-from acquire.store import open_video, video_layout, write_video
+from acquire.errors import DataError, PlaceError, StoreError, UsageError
+from acquire.store import MosaicWriter, open_video, video_layout, video_writer, write_video
 
 TIME = np.int64(1_790_000_000_000_000_000)
 
@@ -183,6 +184,35 @@ def test_what_cannot_be_written_is_refused_untouched(tmp_path, wrong):
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.parametrize("step", ["_column", "_whole"])
+def test_a_disk_that_refuses_the_first_files_is_left_as_it_was(tmp_path, monkeypatch, step):
+    def refuse(*_):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(video_writer, step, refuse)
+    with pytest.raises(StoreError, match="No space left"):
+        write_video(tmp_path / "v.zarr", *make(), 5.0, 30_000.0, {})
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_disk_that_refuses_a_mosaic_is_left_as_it_was(tmp_path, monkeypatch):
+    def refuse(*_):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(zarr.Array, "resize", refuse)
+    with pytest.raises(StoreError, match="No space left"):
+        MosaicWriter(tmp_path / "v.zarr", (2, 2), 4, video_layout.VideoGrid((1.0, 1.0, 1.0)), make()[1])
+    assert not list(tmp_path.iterdir())
+
+
+def test_the_remains_of_a_killed_run_with_the_same_process_number_hinder_nobody(tmp_path):
+    """In a container, each run may have the same number."""
+    left = tmp_path / f".v.zarr.{os.getpid()}.partial"
+    zarr.create_group(left)
+    write_video(tmp_path / "v.zarr", *make(), 5.0, 30_000.0, {})
+    assert {path.name for path in tmp_path.iterdir()} == {"v.zarr", left.name}
+
+
 def test_what_is_not_a_video_says_so(tmp_path):
     with pytest.raises(PlaceError, match="does not exist"):
         open_video(tmp_path / "v.zarr")
@@ -191,6 +221,52 @@ def test_what_is_not_a_video_says_so(tmp_path):
     zarr.create_group(tmp_path / "g.zarr")
     with pytest.raises(PlaceError, match="not a video"):
         open_video(tmp_path / "g.zarr")
+
+
+def scaled(*scale):
+    return {
+        "multiscales": [
+            {
+                "axes": [{}],
+                "datasets": [{"coordinateTransformations": [{"type": "scale", "scale": list(scale)}]}],
+            }
+        ]
+    }
+
+
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [
+        ("ome", 5),
+        ("ome", {"multiscales": []}),
+        ("ome", scaled("x", 1, 1)),
+        ("ome", scaled(0, 1, 1)),
+        ("ome", scaled(1e999, 1, 1)),
+        ("ome", scaled(1, 1)),
+        ("provenance", 5),
+        ("provenance", {"trusted": 5}),
+        ("provenance", {"trusted": ["a", "b"]}),
+        ("provenance", {"trusted": [1e999, 5]}),
+        ("provenance", {"error": 5}),
+        ("provenance", {"segments": 5}),
+        ("provenance", {"segments": [5]}),
+    ],
+    ids=str,
+)
+def test_impossible_attributes_of_a_video_are_damage(tmp_path, key, value):
+    write_video(tmp_path / "v.zarr", *make(), 5.0, 30_000.0, {"trusted": [1, 4]})
+    root = json.loads((tmp_path / "v.zarr" / "zarr.json").read_text())
+    root["attributes"][key] = value
+    (tmp_path / "v.zarr" / "zarr.json").write_text(json.dumps(root))
+    with pytest.raises(DataError, match="is damaged"):
+        open_video(tmp_path / "v.zarr")
+
+
+def test_times_that_are_not_those_of_the_frames_are_damage(tmp_path):
+    write_video(tmp_path / "v.zarr", *make(), 5.0, 30_000.0, {})
+    zarr.open_array(tmp_path / "v.zarr" / "time").resize((3,))
+    with pytest.raises(DataError, match="3 times"):
+        open_video(tmp_path / "v.zarr")
 
 
 def test_a_pipe_in_the_place_of_a_video_keeps_nobody_waiting(tmp_path):

@@ -87,6 +87,7 @@ def demo(
         trigger=trigger,
     )
     rig = load_rig(config, trigger_settings(plan))
+    # Before the slow imports, and before anything is written.
     check(plan, rig)
 
     from acquire.cli.demo.analysis import analyse

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import subprocess
 import sys
-import tempfile
 import time
 from contextlib import contextmanager
 from dataclasses import dataclass
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 from acquire.cli.demo.plan import trigger_settings
+from acquire.cli.places import SOCKET, private_directory
 from acquire.cli.progress import stage_progress
 from acquire.client import Client
 from acquire.daemon.states import SEALED, State
@@ -19,6 +18,7 @@ from acquire.errors import AcquireError, DataError, NoDaemonError
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
+    from pathlib import Path
 
     from acquire.cli.demo.plan import DemoPlan
     from acquire.cli.journal import Journal
@@ -45,8 +45,8 @@ class Captured:
 def record(plan: DemoPlan, journal: Journal) -> Captured:
     """Start a daemon, arm, record, and end the daemon again; its log goes to daemon.log."""
     log, path = plan.out / LOG, plan.out / "recording.zarr"
-    with tempfile.TemporaryDirectory(prefix="acquire-") as directory:  # socket paths must be short
-        socket = Path(directory) / "acquire.sock"
+    with private_directory() as directory:
+        socket = directory / SOCKET
         with daemon(plan, socket) as process, Client(socket) as client:
             with journal.stage("Start the daemon") as note:
                 await_daemon(client, process, log)
@@ -58,6 +58,7 @@ def record(plan: DemoPlan, journal: Journal) -> Captured:
                 client.start(path, lines=plan.lines)
                 with stage_progress("recording") as advance:
                     status = follow(client, plan.lines, advance)
+                # The report compares with the truth: lines that are missing would be blamed on the solvers.
                 if status.last is None or status.last.condition != "GOOD":
                     reason = status.fault or (
                         status.last and f"{status.last.condition}: {status.last.end_reason}"

@@ -79,6 +79,7 @@ def trigger_settings(plan: DemoPlan) -> dict[str, str | int]:
 
     timing = load_rig(plan.config).trigger
     ticks, clock_hz = timing.substep_ticks, timing.clock_hz
+    # Whole clocks only, so that the sub-step lasts exactly as long as in the rig file.
     if ticks % RTL_TICKS == 0 and clock_hz * RTL_TICKS // ticks >= RTL_LEAST_HZ:
         ticks, clock_hz = RTL_TICKS, clock_hz * RTL_TICKS // ticks
     return {"trigger.driver": "rtl", "trigger.clock_hz": clock_hz, "trigger.substep_ticks": ticks}
@@ -152,6 +153,7 @@ def _check_rig(plan: DemoPlan, rig: RigConfig) -> None:
         raise UsageError(
             f"the demo cannot use {plan.config} with code.kind = {rig.code.kind!r}", possible="'prbs'"
         )
+    # What the comparison with the truth needs: whole voxels, frames for SSIM, time for a sinusoid's fit.
     geometry = rig.geometry.segment(SEGMENT_LINES)
     if geometry.size % N_M or geometry.size < N_M * LEAST_SIDE:
         raise UsageError(

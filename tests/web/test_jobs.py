@@ -1,0 +1,79 @@
+"""The page's jobs and glimpses, whatever their processes do."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import os
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from acquire.web import glimpser, jobs, worker
+from acquire.web.messages import JobFacts, JobRequest
+
+LONG = """
+import sys
+sys.stderr.write("x" * 2**20)
+sys.stderr.write("\\nafterwards\\n")
+"""
+
+
+def test_a_job_that_prints_an_endless_line_ends_and_is_followed() -> None:
+    async def follow() -> tuple[int, str]:
+        request = JobRequest(kind="cut", recording="r.zarr", first_line=0, lines=1)
+        facts = JobFacts(id=1, kind="cut", recording="r.zarr", first_line=0, lines=1, state="running")
+        job = jobs._Job(facts, request, [], "", 1.0)
+        job.process = await asyncio.create_subprocess_exec(
+            sys.executable, "-c", LONG, stderr=asyncio.subprocess.PIPE, limit=jobs.MOST_LINE_BYTES
+        )
+        try:
+            async with asyncio.timeout(60):
+                await jobs._follow_progress(job)
+                return await job.process.wait(), job.facts.text
+        finally:
+            with contextlib.suppress(ProcessLookupError):
+                job.process.kill()
+            await job.process.wait()
+
+    assert asyncio.run(follow()) == (0, "afterwards")
+
+
+def test_a_job_whose_page_died_while_it_was_started_does_not_begin(tmp_path: Path) -> None:
+    """The kernel's signal at the page's death is only sent to those who have asked for it by then."""
+    words = [sys.executable, "-m", "acquire.web.worker", "plugins", "--json"]
+    for owner, begins in ((os.getpid(), True), (1, False)):
+        environment = os.environ | {worker.OWNER: str(owner)}
+        done = subprocess.run(words, env=environment, capture_output=True, check=True, timeout=300)
+        assert bool(done.stdout) is begins
+
+
+def test_glimpses_come_once_a_process_can_be_started_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(glimpser, "AGAIN_S", 0.01)
+    really, refusals = asyncio.create_subprocess_exec, [BlockingIOError(11, "no process")]
+
+    async def start(*_: Any, **how: Any) -> asyncio.subprocess.Process:
+        if refusals:
+            raise refusals.pop()
+        program = "import os; os.write(1, bytes(8))"  # an empty glimpse
+        return await really(sys.executable, "-c", program, **how)
+
+    monkeypatch.setattr(asyncio, "create_subprocess_exec", start)
+
+    async def watch() -> int:
+        came = asyncio.Event()
+        owner = glimpser.Glimpser(Path("none.sock"), came.set)
+        owner.watch()
+        running = asyncio.create_task(owner.run())
+        try:
+            async with asyncio.timeout(60):
+                await came.wait()
+        finally:
+            running.cancel()
+            await asyncio.gather(running, return_exceptions=True)
+        return owner.number
+
+    assert asyncio.run(watch()) >= 1
