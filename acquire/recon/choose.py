@@ -23,6 +23,7 @@ from acquire.arrays import host
 from acquire.recon.blinking import (
     EXPLAINED,
     FIRST_LOOK_SHARE,
+    FREER,
     GLANCE,
     LONGER_LOOK,
     complete_look,
@@ -74,9 +75,6 @@ the still where its prior is strong, and need only be better."""
 CLOSE, DOUBTFUL = 1.1, 2.0
 """Largest error of the cosines, relative to the best trial's, for which they are continued, and for which
 they are if clear patterns were found, or if only a glance was taken."""
-FREER = 0.85
-"""Largest error of cosines that are no patterns, relative to that of a still or a volume, for which they are
-preferred: they admit the most noise. With equal errors a volume is 2 to 8 dB better."""
 
 
 class AdmmSolver(Solver):
