@@ -363,6 +363,13 @@ def test_specs_that_cannot_be_recorded_are_refused(wrong):
         make_spec(**wrong)
 
 
+def test_a_chunk_of_tags_that_no_reader_would_take_is_refused():
+    """255 chunks of 2**20 lines: 2 GB of ticks in one piece, of which no line was readable before all."""
+    with pytest.raises(UsageError, match=r"tag_chunks = 252 of 1048576 lines; possible: 1 to 8: 8388608 lin"):
+        make_spec(chunk_lines=2**20, shard_chunks=252, tag_chunks=252)
+    make_spec(chunk_lines=2**20, shard_chunks=248, tag_chunks=8)
+
+
 def test_a_ledger_that_is_not_json_is_refused_before_the_end(path):
     with RecordingWriter.create(path, make_spec()) as writer:
         with pytest.raises(UsageError, match="ledger"):
