@@ -390,3 +390,11 @@ def test_foreign_text_is_escaped_before_it_reaches_a_terminal(cli: Cli, recordin
     answer = cli("info", odd, "--json")
     assert answer.code == 0, answer.err
     assert answer.json["end_reason"] == HOSTILE
+
+
+def test_a_path_as_the_target_of_an_upload_is_told_its_url(cli: Cli, recording: Path, tmp_path: Path) -> None:
+    """The advice was to install a package for the protocol ./copy.zarr."""
+    answer = cli("upload", recording, str(tmp_path / "copy.zarr"))
+    assert answer.code == 2
+    assert "copy.zarr is not a URL; possible: file:///" in answer.err.replace("\n  ", "; ")
+    assert f"try: file://{tmp_path}/copy.zarr" in answer.err

@@ -23,6 +23,7 @@ from acquire import store
 from acquire.errors import DataError, PlaceError, StoreError, UsageError
 from acquire.lines import ARMS, LineFlag
 from acquire.store import FORMAT, Event, Gap, RecordingWriter, RunCondition, open_recording, verify
+from acquire.store.files import check_new_path
 
 
 @pytest.fixture
@@ -295,6 +296,21 @@ def test_what_cannot_be_a_path_is_refused(tmp_path, name):
         RecordingWriter.create(tmp_path / name, make_spec())
     assert str(caught.value).encode()  # can be printed
     assert not any(tmp_path.iterdir())
+
+
+def test_nothing_is_created_within_a_recording_but_beside_it_and_within_other_groups(path, tmp_path):
+    """A video that was written into its recording went with every copy of it, and with its deletion."""
+    writer = RecordingWriter.create(path, make_spec())
+    writer.seal(RunCondition.GOOD, "stopped", {})
+    (tmp_path / "link").symlink_to(path / "a")
+    for inner in (path / "v.zarr", path / "a" / "v.zarr", tmp_path / "link" / "v.zarr"):
+        with pytest.raises(
+            UsageError, match=r"would be a part of .*; possible: a path outside.*; try: .*v\.zarr"
+        ):
+            check_new_path(inner)
+    zarr.create_group(tmp_path / "mine.zarr", zarr_format=3, attributes={"format": "mine"})
+    for beside in (tmp_path / "v.zarr", tmp_path / "mine.zarr" / "v.zarr"):
+        check_new_path(beside)
 
 
 @pytest.mark.parametrize(
