@@ -18,6 +18,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Literal, Protocol
 
 from acquire.errors import UsageError
+from acquire.text import shortened
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -96,11 +97,15 @@ class PrbsCode:
     @classmethod
     def from_seed(cls, degree: int, seed: int) -> PrbsCode:
         """Return the code that a seed in a configuration stands for: its state is mixed from the seed."""
+        _check_register(degree, 1)
+        if not _is_whole(seed):
+            raise UsageError(f"a prbs code cannot have the seed {seed!r}", possible="an integer")
         return cls(degree, mix_seed(seed, degree), seed)
 
     def bits(self, start: int, length: int) -> NDArray[np.uint8]:
         import numpy as np
 
+        _check_range(start, length)
         dark = min(max(-start, 0), length)
         lit = prbs(self.degree, self.state, max(start, 0), length - dark)
         return np.concatenate([np.zeros(dark, np.uint8), lit])
@@ -131,6 +136,7 @@ class ConstantCode:
     def bits(self, start: int, length: int) -> NDArray[np.uint8]:
         import numpy as np
 
+        _check_range(start, length)
         index = np.arange(start, start + length)
         return np.where(index < 0, 0, self.value).astype(np.uint8)
 
@@ -164,11 +170,18 @@ class ListedCode:
         """Return the code with these bits (0 or 1)."""
         import numpy as np
 
-        return cls(np.packbits(bits).tobytes().hex(), len(bits), repeats)
+        given = np.asarray(bits)
+        if given.ndim != 1 or given.dtype.kind not in "biu" or (given > 1).any() or (given < 0).any():
+            raise UsageError(
+                f"an array of shape {given.shape} and dtype {given.dtype} is no list of code bits",
+                possible="(bit,) of 0 and 1, as integers",
+            )
+        return cls(np.packbits(given).tobytes().hex(), len(given), repeats)
 
     def bits(self, start: int, length: int) -> NDArray[np.uint8]:
         import numpy as np
 
+        _check_range(start, length)
         listed = np.unpackbits(np.frombuffer(bytes.fromhex(self.digits), np.uint8), count=self.length)
         index = np.arange(start, start + length)
         inside = (index >= 0) & (self.repeats | (index < self.length))
@@ -185,7 +198,20 @@ class ListedCode:
 
 
 def code_from_attrs(attrs: Mapping[str, Any]) -> Code:
-    """Return the code that a recording's ``code`` attribute describes. Raises UsageError if it is unknown."""
+    """Return the code that a recording's ``code`` attribute describes.
+
+    Raises UsageError if there is none, or the attribute lacks something.
+    """
+    try:
+        return _described(attrs)
+    except (AttributeError, KeyError, TypeError, ValueError) as error:
+        raise UsageError(
+            f"a code attribute {shortened(repr(attrs))} describes no code: {type(error).__name__}: {error}",
+            possible="what the `to_attrs` of a code returns",
+        ) from error
+
+
+def _described(attrs: Mapping[str, Any]) -> Code:
     kind = attrs.get("kind")
     if kind == "prbs":
         degree = int(attrs["degree"])
@@ -215,10 +241,7 @@ def prbs(degree: int, state: int, start: int, length: int) -> NDArray[np.uint8]:
     The cost is logarithmic in ``start`` and linear in ``length``, at numpy speed.
     """
     _check_register(degree, state)
-    if start < 0 or length < 0:
-        raise UsageError(
-            f"bits of a prbs code cannot have start = {start} and length = {length}", possible="0 or more"
-        )
+    _check_range(start, length, least=0)
     window = _window(degree, state, start)
     if length <= degree:
         return window[:length]
@@ -231,6 +254,7 @@ def state_at(degree: int, state: int, index: int) -> int:
     After ``degree`` steps the state depends only on the bits emitted since, whatever it was before.
     """
     _check_register(degree, state)
+    _check_range(index, 0, least=0)
     mask = sum(1 << (tap - 1) for tap in TAPS[degree])
     if index < degree:
         for _ in range(index):
@@ -254,12 +278,25 @@ def mix_seed(number: int, degree: int) -> int:
     return (z ^ (z >> 31)) & ((1 << degree) - 1) or 1
 
 
+def _is_whole(value: object) -> bool:
+    """Whether a value is an integer, also one of numpy's."""
+    return hasattr(value, "__index__")
+
+
+def _check_range(start: int, length: int, least: int | None = None) -> None:
+    if not _is_whole(start) or not _is_whole(length) or length < 0 or (least is not None and start < least):
+        raise UsageError(
+            f"bits of a code cannot have start = {start!r} and length = {length!r}",
+            possible=f"integers, {'start and length' if least == 0 else 'length'} 0 or more",
+        )
+
+
 def _check_register(degree: int, state: int) -> None:
     if degree not in TAPS:
         raise UsageError(f"there is no prbs code of degree {degree}", possible=", ".join(map(str, TAPS)))
-    if not 0 < state < 1 << degree:
+    if not _is_whole(state) or not 0 < state < 1 << degree:
         raise UsageError(
-            f"a prbs code of degree {degree} cannot have the state {state:#x}",
+            f"a prbs code of degree {degree} cannot have the state {state!r}",
             possible=f"1 to {(1 << degree) - 1:#x}",
         )
 

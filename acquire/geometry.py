@@ -124,3 +124,17 @@ class Geometry:
 def is_integer(value: object) -> bool:
     """Whether a value is an integer by type: neither 3.0 nor True."""
     return isinstance(value, int) and not isinstance(value, bool)
+
+
+def is_index(value: object) -> bool:
+    """Whether a value can count something: as `is_integer`, and also numpy's integers."""
+    return hasattr(value, "__index__") and not isinstance(value, bool)
+
+
+def check_integers(**values: object) -> None:
+    """Raise UsageError for the first of these arguments that is no integer."""
+    for name, value in values.items():
+        if not is_index(value):
+            raise UsageError(
+                f"{name} cannot be {value!r}", possible="an integer", hint="int(...), which truncates"
+            )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -47,10 +48,11 @@ class Noise:
 
     def merged(self, count: int) -> Noise:
         """Return the noise of sums of ``count`` × ``count`` samples."""
-        a, b = self.dark_noise_dn
-        # Variances add up, and K relates sums of light and of variance alike. Rounding counts once, as if the
-        # sensor had merged the samples.
-        return Noise(self.dn_per_electron, (a * count, b * count))
+        # Variances add up, and K relates sums of light and of variance alike. Each sample was rounded; one
+        # rounding is added by `variance_dn2`, and the others are part of the sum's dark noise.
+        rounding = (count**2 - 1) * QUANTISATION_DN2
+        a, b = (math.sqrt((dark * count) ** 2 + rounding) for dark in self.dark_noise_dn)
+        return Noise(self.dn_per_electron, (a, b))
 
     def with_ambient(self, light_dn: tuple[float, float]) -> Noise:
         """Return the noise with the shot noise of each arm's ambient light added to the dark noise."""

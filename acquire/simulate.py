@@ -18,6 +18,7 @@ from acquire import __version__
 from acquire.calibrate.choose import carried_calibration
 from acquire.clock import ClockFit
 from acquire.errors import AcquireError, UsageError
+from acquire.geometry import check_integers
 from acquire.lines import ARMS, LineBlock, LineFlag
 from acquire.noise import QUANTISATION_DN2
 from acquire.sim.pipeline import Bench, describe
@@ -128,6 +129,7 @@ def simulate(
     Everything that can be refused is refused with a UsageError before ``path`` exists. A later failure or
     interruption leaves a sealed recording that states it.
     """
+    check_integers(lines=lines)
     if not 1 <= lines <= MOST_SIMULATED_LINES:
         raise UsageError(
             f"a simulation of {lines} lines is not possible", possible=f"1 to {MOST_SIMULATED_LINES} lines"
@@ -154,6 +156,9 @@ def study(bench: Bench, code: Code, lines: int = STUDIED_LINES) -> Study:
     """Leave out one effect at a time, over ``lines`` lines of both arms that are exposed throughout."""
     from acquire.sim.effects import in_order
 
+    check_integers(lines=lines)
+    if lines < 1:
+        raise UsageError(f"a study of {lines} lines is not possible", possible="1 or more")
     us_per_line = _times(bench, code, lines)
     stages = [stage for arm in ARMS for stage in bench.camera(arm, code).stages]
     place_of = {stage.effect: stage.place for stage in reversed(stages)}

@@ -103,8 +103,12 @@ class RunSeen(ctypes.Structure):
     pulses_b: int
     line_clocks: int
     """0 until it is known."""
+    delay_a: int
+    delay_b: int
+    """Clocks from a line to its pulse; known with the first pulse."""
     _fields_ = tuple(
-        (name, ctypes.c_uint64) for name in ("number", "running", "pulses_a", "pulses_b", "line_clocks")
+        (name, ctypes.c_uint64)
+        for name in ("number", "running", "pulses_a", "pulses_b", "line_clocks", "delay_a", "delay_b")
     )
 
 

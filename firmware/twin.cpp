@@ -31,6 +31,7 @@ struct Run {
     uint64_t running = 0;
     uint64_t pulses[2] = {0, 0};  // rising edges of the triggers
     uint64_t line_clocks = 0;     // 0: not known yet
+    uint64_t delays[2] = {0, 0};  // clocks from a line to its pulse, of each trigger's first pulse
 };
 
 constexpr unsigned PIN_CLOCKS = 2;
@@ -75,12 +76,17 @@ static void end_line(Twin &twin) {
     twin.line_began = twin.clock;
 }
 
+static void count_pulse(Twin &twin, int arm, bool rises) {
+    if (!rises) return;
+    if (twin.run.pulses[arm]++ == 0) twin.run.delays[arm] = twin.clock - twin.line_began;
+}
+
 // One clock of the run as cameras and light see it; true where a run begins or ends.
 static bool follow(Twin &twin, uint64_t before, uint64_t pins, Exchange &exchange) {
     twin.running_was = twin.running_was << 1 | ((pins & RUNNING) != 0);
     const bool running = twin.running_was >> PIN_CLOCKS & 1, turns = running != (twin.run.running != 0);
     if (turns && running) {
-        twin.run = {twin.run.number + 1, 1, {0, 0}, 0};
+        twin.run = {twin.run.number + 1, 1, {0, 0}, 0, {0, 0}};
         twin.lines = false;
     } else if (turns) {
         end_substep(twin, exchange);
@@ -88,12 +94,12 @@ static bool follow(Twin &twin, uint64_t before, uint64_t pins, Exchange &exchang
         twin.run.running = 0;
     }
     const uint64_t rises = pins & ~before;
-    twin.run.pulses[0] += (rises & TRIGGER_A) != 0;
-    twin.run.pulses[1] += (rises & TRIGGER_B) != 0;
-    if (pins & LINE) {
+    if (pins & LINE) {  // before the pulses: one without delay comes with its line
         end_line(twin);
         twin.lines = true;
     }
+    count_pulse(twin, 0, rises & TRIGGER_A);
+    count_pulse(twin, 1, rises & TRIGGER_B);
     if (pins & SUBSTEP) end_substep(twin, exchange);
     if (running && (pins & SUBSTEP || twin.substep_clocks != 0)) {
         ++twin.substep_clocks;

@@ -45,6 +45,7 @@ class Publisher:
                 bool(run.running),
                 (run.pulses_a, run.pulses_b),
                 run.line_clocks,
+                (run.delay_a, run.delay_b),
             )
             self._page.publish(pins, light, self._clock_hz)
 

@@ -6,11 +6,11 @@ genicam is imported when first used, never with this module: importing it change
 from __future__ import annotations
 
 import logging
-import time
 from collections import deque
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
+from acquire.camera.settings import await_done
 from acquire.errors import CameraError, CameraLostError
 
 if TYPE_CHECKING:
@@ -18,7 +18,6 @@ if TYPE_CHECKING:
 
     from acquire.camera.settings import Kind, Value
 
-_COMMAND_S = 5.0
 _KINDS: dict[str, Kind] = {
     "intfIInteger": "integer",
     "intfIFloat": "float",
@@ -120,11 +119,7 @@ class GenapiNode:
                 self._node.value = value
             elif value:
                 self._node.execute()
-                deadline = time.monotonic() + _COMMAND_S
-                while not self._node.is_done():
-                    if time.monotonic() > deadline:
-                        raise CameraError(f"{self.name} is not done after {_COMMAND_S:g} s")
-                    time.sleep(0.001)
+                await_done(self.name, self._node.is_done)
 
     def limits(self) -> tuple[float, float, float]:
         with translated(self.name):

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import difflib
 import math
+import time
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal, Protocol
 
@@ -16,7 +17,7 @@ from acquire.errors import CameraError
 from acquire.text import shown
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping
+    from collections.abc import Callable, Iterable, Mapping
 
 MODULES = ("remote", "interface", "device", "stream", "system")
 """GenTL modules with features: the camera itself, then the host's side."""
@@ -26,6 +27,8 @@ Value = bool | int | float | str
 
 _LONG = 1e15
 """Limits from here on are those of the type, not of the camera, and are shown with few digits."""
+COMMAND_S = 5.0
+"""Time for the camera to carry out a command."""
 FLOAT_TOLERANCE = 1e-3
 """Relative tolerance for the rounding of cameras; a larger difference is another value."""
 
@@ -40,6 +43,22 @@ class Setting:
 
     def __str__(self) -> str:
         return f"{self.module} {self.feature} = {shown(self.value)}"
+
+
+def await_done(command: str, is_done: Callable[[], bool]) -> None:
+    """Wait until the camera has carried out a command: one that loads settings overwrites what is set before.
+
+    Raises CameraError if it has not after `COMMAND_S`.
+    """
+    deadline = time.monotonic() + COMMAND_S
+    while not is_done():
+        if time.monotonic() > deadline:
+            raise CameraError(
+                f"{command} is not done after {COMMAND_S:g} s",
+                possible="the camera may still be carrying it out",
+                hint="the camera's manual says when it takes the command",
+            )
+        time.sleep(0.001)
 
 
 class Node(Protocol):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -52,10 +53,13 @@ def list_recordings(
     directory: Annotated[Path, typer.Argument(metavar="DIR", help="Directory to list.")] = Path(),
     json: JsonFlag = False,
 ) -> None:
-    """List the recordings in a directory, or one recording. Damaged ones are marked; videos are not listed.
+    """List the recordings in a directory, or one recording. Damaged ones are marked.
+
+    Videos and calibrations are not listed.
 
     Example: [bold]acquire ls /data[/]
     """
+    from acquire.store import open_outline
     from acquire.store.refusals import refused
 
     with refused(directory, "listed", "a directory of recordings; `acquire info` describes one"):
@@ -63,10 +67,14 @@ def list_recordings(
         if (directory / "zarr.json").is_file():
             named = [directory.absolute()]  # "." has no name to list
     found = [facts for path in named if (facts := _summary(path)) is not None]
+    if not found and named == [directory.absolute()]:
+        open_outline(directory)  # which says what it is, and what shows it
     if json:
         print_json(found)
     elif not found:
-        say(f"there are no recordings in {directory}")
+        kinds = Counter(kind for path in named if (kind := _other_kind(path)) is not None)
+        others = ", ".join(f"{count} {kind}{'s' * (count > 1)}" for kind, count in sorted(kinds.items()))
+        say(f"there are no recordings in {directory}" + (f", but {others}" if others else ""))
     else:
         print_table(COLUMNS, map(list_row, found))
 
@@ -271,17 +279,19 @@ def _print_list(title: str, items: Iterable[str]) -> None:
 
 
 def _summary(path: Path) -> dict[str, Any] | None:
-    """Return the facts of a recording for a list, or its error; None for a video and for a plain file."""
-    from acquire.store import format_of, open_outline
+    """Return the facts of a recording for a list, or its error; None for a plain file and what is listed
+    elsewhere.
+    """
+    from acquire.store import open_outline
     from acquire.store.layout import DAMAGE
 
     try:
         # A recording on a disk that is not mounted must not be left out without a word.
         if path.is_symlink() and not path.exists():
             return {"path": str(path), "error": f"{path}: a link to {path.readlink()}, which does not exist"}
-        if not path.is_dir() or (format_of(path) or "").startswith("acquire-video/"):
+        if not path.is_dir() or _other_kind(path) is not None:
             return None
-    except (AcquireError, OSError):
+    except OSError:
         pass  # it may be a damaged recording, which is reported below
     try:
         opened = open_outline(path)
@@ -292,6 +302,17 @@ def _summary(path: Path) -> dict[str, Any] | None:
         return {"path": str(path), "error": f"{path} cannot be read: {error}"}
     keys = ("path", "run_id", "state", "run_condition", "lines", "duration_s", "bytes", "start_ns", "damage")
     return {key: facts[key] for key in keys}
+
+
+def _other_kind(path: Path) -> str | None:
+    """Return "video" or "calibration"; None for anything else."""
+    from acquire.store import format_of
+    from acquire.store.opening import other_kind
+
+    try:
+        return other_kind(format_of(path))
+    except (AcquireError, OSError):
+        return None
 
 
 def _damage(recording: Outline) -> str | None:

@@ -70,16 +70,17 @@ class Target:
         """Return the target for a socket's path, a URL, or None for the default socket."""
         text = "" if place is None else str(place)
         if not text.startswith(("http://", "https://")):
+            # Path would make "ftp:/..." of it: a file that nobody meant.
+            if "://" in text:
+                raise _no_address(text)
             return cls(socket=default_socket() if place is None else Path(place).absolute())
-        parts = urlsplit(text)
         try:
+            parts = urlsplit(text)
             port = parts.port or (443 if parts.scheme == "https" else 80)
         except ValueError:
-            port = 0
-        if not (parts.hostname and port) or parts.path.strip("/") or parts.query:
-            raise UsageError(
-                f"{text} is not a valid address", possible="http://HOST:PORT, or a socket's path"
-            )
+            raise _no_address(text) from None
+        if not parts.hostname or parts.path.strip("/") or parts.query:
+            raise _no_address(text)
         tls = parts.scheme == "https"
         token = token or os.environ.get(TOKEN_VARIABLE)
         return cls(None, parts.hostname, port, tls, token)
@@ -97,6 +98,12 @@ class Target:
         host = f"[{self.host}]" if ":" in self.host else self.host
         headers = {"Host": host if self.socket is not None else f"{host}:{self.port}"}
         return headers | ({"Authorization": f"Bearer {self.token}"} if self.token else {})
+
+
+def _no_address(text: str) -> UsageError:
+    return UsageError(
+        f"{shortened(text)} is not a valid address", possible="http://HOST:PORT, or a socket's path"
+    )
 
 
 @dataclass(frozen=True, slots=True)

@@ -9,14 +9,14 @@ from __future__ import annotations
 import asyncio
 from collections import OrderedDict
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from acquire.errors import UsageError
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable
 
-    from acquire.daemon.messages import Status
+T = TypeVar("T")
 
 MOST_KEPT = 256
 """Number of answers that are kept; the oldest is dropped first."""
@@ -26,7 +26,7 @@ LONGEST_ID = 128
 @dataclass(slots=True)
 class _Kept:
     request: str
-    answer: asyncio.Future[Status]
+    answer: asyncio.Future[Any]
 
 
 class Answers:
@@ -36,9 +36,7 @@ class Answers:
         self._most = kept
         self._kept: OrderedDict[str, _Kept] = OrderedDict()
 
-    async def once(
-        self, request_id: str | None, request: str, work: Callable[[], Awaitable[Status]]
-    ) -> Status:
+    async def once(self, request_id: str | None, request: str, work: Callable[[], Awaitable[T]]) -> T:
         """Carry out ``work``, or return the answer, or raise the error, of an earlier request with this ID.
 
         ``request`` describes the request. Raises UsageError if the ID was used for a different one. The work
@@ -61,10 +59,11 @@ class Answers:
                 for key in over[: max(0, len(self._kept) - self._most)]:
                     del self._kept[key]
         # A client that goes away cancels its request, but not the command being carried out.
-        return await asyncio.shield(known.answer)
+        answer: T = await asyncio.shield(known.answer)
+        return answer
 
 
-def _retrieve(answer: asyncio.Future[Status]) -> None:
+def _retrieve(answer: asyncio.Future[Any]) -> None:
     """Retrieve the error, which asyncio would report if the client is gone; it is logged already."""
     if not answer.cancelled():
         answer.exception()

@@ -5,7 +5,7 @@ So a page, a script and the command line use the same API, whichever process ans
 
 from __future__ import annotations
 
-from collections.abc import AsyncIterator, Awaitable, Callable
+from collections.abc import AsyncIterator
 from typing import Annotated, Any, Protocol
 
 from fastapi import APIRouter, Depends, Header, Query, Response
@@ -86,8 +86,7 @@ def routes(api: Api, answers: Answers) -> APIRouter:
 
 
 def _add_commands(router: APIRouter, api: Api, answers: Answers) -> None:
-    async def once(request_id: str | None, asked: str, work: Callable[[], Awaitable[Status]]) -> Status:
-        return await answers.once(request_id, asked, work)
+    once = answers.once
 
     @router.post("/arm", summary="idle → armed")
     async def arm(request: ArmRequest | None = None, request_id: RequestId = None) -> Status:
@@ -112,12 +111,12 @@ def _add_commands(router: APIRouter, api: Api, answers: Answers) -> None:
 
     # These two may be repeated without harm, and need no request ID.
     @router.post("/capacity", summary="idle: measure what ring, codec and disk sustain here, now")
-    async def measure() -> CapacityStatus:
-        return await api.measure()
+    async def measure(request_id: RequestId = None) -> CapacityStatus:
+        return await once(request_id, "capacity", api.measure)
 
     @router.post("/reload", summary="Reload the rig file; refused as a whole if a key cannot change")
-    async def reload() -> Reloaded:
-        return await api.reload()
+    async def reload(request_id: RequestId = None) -> Reloaded:
+        return await once(request_id, "reload", api.reload)
 
 
 def _add_facts(router: APIRouter, api: Api) -> None:

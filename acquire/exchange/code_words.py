@@ -70,9 +70,16 @@ def _from_array(path: Path) -> NDArray[np.uint8]:
             raise UsageError(f"{path} cannot be read as NumPy: {error}") from error
     # Records cannot be compared with numbers, and complex numbers would lose their imaginary part.
     is_real = found.dtype.kind in "biuf" and found.ndim == 1
-    if not (is_real and 0 < len(found) <= MOST_LISTED_BITS and np.isin(found, (0, 1)).all()):
-        raise UsageError(
-            f"{path} does not hold bits: it is an array of {found.dtype} {found.shape}",
-            possible=f"one axis of up to {MOST_LISTED_BITS} values, 0 or 1",
-        )
-    return np.asarray(found, np.uint8)
+    if is_real and 0 < len(found) <= MOST_LISTED_BITS:
+        # A copy: reading a mapped file that is cut short meanwhile would end this process (SIGBUS).
+        with refused(path, "read"), path.open("rb") as file:
+            raw = file.read(found.offset + found.nbytes)
+        if len(raw) != found.offset + found.nbytes:
+            raise UsageError(f"{path} was changed while it was read", hint="again, once it is written")
+        bits = np.frombuffer(raw, found.dtype, offset=found.offset)
+        if np.isin(bits, (0, 1)).all():
+            return np.asarray(bits, np.uint8)
+    raise UsageError(
+        f"{path} does not hold bits: it is an array of {found.dtype} {found.shape}",
+        possible=f"one axis of up to {MOST_LISTED_BITS} values, 0 or 1",
+    )

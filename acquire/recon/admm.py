@@ -56,6 +56,11 @@ class AdmmParameters:
     preconditioned: bool = False
     joint_tv: bool = False
 
+    @property
+    def penalty(self) -> float:
+        """ρ of the data step, which has both splits."""
+        return self.tv_penalty + self.sign_penalty
+
 
 class Admm:
     """Holds the iterates; `step` is one iteration, `theta` the current estimate (K, n′, n′).
@@ -109,8 +114,10 @@ class Admm:
         self._prepare()
 
     def reweigh(self, parameters: AdmmParameters) -> None:
-        """Continue with other weights; the multipliers, which are stored divided by ρ, keep their value."""
+        """Continue with other weights; what is stored divided by ρ, multipliers and w, keeps its value."""
         old, self._parameters = self._parameters, parameters
+        self._w *= old.penalty / parameters.penalty
+        self._lifted *= old.penalty / parameters.penalty
         self._tv_multiplier *= old.tv_penalty / parameters.tv_penalty
         self._sign_multiplier *= old.sign_penalty / parameters.sign_penalty
         self._strength = self._emphasis * (parameters.tv_weight / parameters.tv_penalty)
@@ -120,7 +127,8 @@ class Admm:
         """Start from the state of another solver with as many coefficients, whatever its weights."""
         old, new = other._parameters, self._parameters
         self.theta = self._xp.asarray(other.theta, copy=True)
-        self._w = self._xp.asarray(other._w, copy=True)
+        # w is the residual of the lines divided by ρ
+        self._w = other._w * (old.penalty / new.penalty)
         self._lifted = self._operator.adjoint(self._w)
         self._tv_multiplier = other._tv_multiplier * (old.tv_penalty / new.tv_penalty)
         # the splits are in units of θ; only multipliers are divided by ρ
@@ -146,7 +154,7 @@ class Admm:
     def _prepare(self) -> None:
         """Set up the preconditioner for the present operator and penalties."""
         p = self._parameters
-        known = self._operator.near_inverse(p.tv_penalty + p.sign_penalty) if p.preconditioned else None
+        known = self._operator.near_inverse(p.penalty) if p.preconditioned else None
         self._precondition: Callable[[Array], Array] = known or (lambda lines: lines)
 
     def step(self) -> None:
@@ -173,7 +181,7 @@ class Admm:
 
     def _data_step(self) -> Array:
         p = self._parameters
-        rho = p.tv_penalty + p.sign_penalty
+        rho = p.penalty
         # the grid's rows are orthonormal, so that both splits together are one ρ/2·‖θ − centre‖²
         centre = self.theta - self._tv_multiplier
         centre *= p.tv_penalty

@@ -10,6 +10,8 @@ import numpy as np
 
 from acquire.arrays import Dtype, open_arrays
 from acquire.cores import granted_threads, idle_cores, limit_blas, limit_threads
+from acquire.errors import UsageError
+from acquire.lines import Segment
 from acquire.recon.aliasing import detect_unresolved_light
 from acquire.recon.balance import balance_of, divided
 from acquire.recon.clock import IterationClock
@@ -29,7 +31,6 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from acquire.lines import Segment
     from acquire.recon.denoisers import Denoiser
     from acquire.recon.error import VideoError
     from acquire.recon.estimates import Estimate
@@ -106,6 +107,12 @@ def reconstruct(
     """
     # a budget covers the whole call
     began = time.monotonic()
+    if not isinstance(segment, Segment):
+        raise UsageError(
+            f"a {type(segment).__name__} cannot be reconstructed",
+            possible="a segment of a recording",
+            hint="recording.cut(first_line=..., lines=...)",
+        )
     chosen = open_solver(solver, solver_options)
     count = preset_iterations(solver, preset)
     if iterations is not None:

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 from acquire.config.plan import FADE_SUBSTEPS
 from acquire.errors import UsageError
+from acquire.geometry import check_integers
 from acquire.recon.segments import Grid, Stream, Stretch, SubSegment, Voxels, split
 from acquire.reconstruct.times import Times, duration
 
@@ -106,6 +108,7 @@ def by_lines(recording: Recording, first_line: int | None = None, lines: int | N
     """Select exactly these lines. Raises UsageError for lines that the recording does not have."""
     whole = stream_of(recording)
     first = whole.first_line if first_line is None else first_line
+    check_integers(first_line=first, lines=0 if lines is None else lines)
     end = whole.end_line if lines is None else first + lines
     if not whole.first_line <= first < end <= whole.end_line:
         possible = f"lines {whole.first_line} to {whole.end_line - 1}" if recording.lines else "no lines yet"
@@ -116,6 +119,11 @@ def by_lines(recording: Recording, first_line: int | None = None, lines: int | N
 def by_time(recording: Recording, begin_ns: int | None, end_ns: int | None) -> Selection:
     """Select the video from ``begin_ns`` to ``end_ns`` after the first read-out, from all lines it needs."""
     times = Times.of(recording)
+    for name, ns in (("begin_ns", begin_ns), ("end_ns", end_ns)):
+        if ns is not None and not math.isfinite(ns):
+            raise UsageError(
+                f"{name} cannot be {ns}", possible="nanoseconds after the first read-out, or None"
+            )
     begin, end = (None if ns is None else times.substep(ns) for ns in (begin_ns, end_ns))
     return Selection(stream_of(recording), times, begin, end)
 
@@ -130,12 +138,16 @@ def in_voxels(
     """
     stream = selection.stream
     size = stream.geometry(1).size
+    if longest is not None and longest < 1:
+        raise UsageError(
+            f"sub-segments of {longest} sub-steps are not possible", possible="1 or more, or None: by default"
+        )
     stream.geometry(1).check_merge(voxels.spatial_merge, voxels.temporal_merge)
     whole = voxels.temporal_merge >= 2 * size if whole_ends is None else whole_ends
     begin, end = selection.extent(voxels, voxels, whole=whole)
     # of long voxels, 4·n sub-steps would be few frames
     default = max(SPANS_PER_SEGMENT * size, VOXELS_PER_SEGMENT * voxels.temporal_merge)
-    stretches = tuple(split(begin, end, voxels, longest or default))
+    stretches = tuple(split(begin, end, voxels, default if longest is None else longest))
     return VideoRequest(stream, stretches, Grid.finest(stretches, size), _trusted(stream, begin, end))
 
 
@@ -146,7 +158,10 @@ def in_glimpses(selection: Selection, voxels: Voxels, count: int) -> VideoReques
     shorter than the voxels.
     """
     stream = selection.stream
+    stream.geometry(1).check_merge(voxels.spatial_merge, voxels.temporal_merge)
     begin, end = selection.extent(voxels, voxels, whole=False)
+    if count < 1:
+        raise UsageError(f"{count} glimpses are not possible", possible="1 or more")
     length = (end - begin) // count
     if length < voxels.temporal_merge:
         most = (end - begin) // voxels.temporal_merge

@@ -35,8 +35,9 @@ if TYPE_CHECKING:
 ROOM = 1 << 23
 """Number of sub-steps whose light is kept: more than a minute."""
 _HEADER_BYTES = 4096
-# indices of 64-bit words; two are pulses, one for each arm
-_SEQUENCE, _RUN, _RUNNING, _PULSES, _SUBSTEPS, _PERIOD_CLOCKS, _CLOCK_HZ, _FIELDS = 0, 1, 2, 3, 5, 6, 7, 8
+# indices of 64-bit words; two are pulses and two are delays, one for each arm
+_SEQUENCE, _RUN, _RUNNING, _PULSES, _SUBSTEPS = 0, 1, 2, 3, 5
+_PERIOD_CLOCKS, _CLOCK_HZ, _DELAYS, _FIELDS = 6, 7, 8, 10
 _POLL_S = 0.001
 _LIGHT_S = 10.0
 """Longest wait of a camera for light, which it needs some hundred lines ahead."""
@@ -54,6 +55,8 @@ class PinRun:
     pulses: tuple[int, int]
     """Rising edges of trigger A and B."""
     line_clocks: int
+    delay_clocks: tuple[int, int] = (0, 0)
+    """From a line to its pulses A and B."""
 
 
 class PinPage:
@@ -99,6 +102,7 @@ class PinPage:
             done + len(light),
             run.line_clocks,
             clock_hz,
+            *run.delay_clocks,
         )
         header[_SEQUENCE] += np.uint64(1)
 
@@ -160,6 +164,7 @@ class PinWire:
         if fields[_RUN] == 0:
             return Reading(None, 0)
         period_ns = Fraction(fields[_PERIOD_CLOCKS] * NS_PER_S, fields[_CLOCK_HZ])
+        delay_s = fields[_DELAYS + ARMS.index(self.arm)] / fields[_CLOCK_HZ]
         stopped = None if fields[_RUNNING] else issued
         code = {"kind": "pins", "run": fields[_RUN]}
         return Reading(
@@ -171,6 +176,7 @@ class PinWire:
                 speed=Fraction(1),
                 code=code,
                 stopped_after=stopped,
+                settled_s={self.arm: delay_s},
             ),
             issued,
         )

@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from acquire.errors import StateError, UsageError
-from acquire.reading import kind_of, open_regular
+from acquire.reading import kind_of, open_regular, read_object
 from acquire.store.pages import aligned_bytes, open_direct
 
 if TYPE_CHECKING:
@@ -51,6 +51,23 @@ def check_new_path(path: Path) -> None:
         raise UsageError(f"{path}: the directory {path.parent} does not exist", hint="create it first")
     if not os.access(path.parent, os.W_OK | os.X_OK):
         raise UsageError(f"{path}: the directory {path.parent} is not writable", hint="another directory")
+    inside = path.parent.resolve()
+    for directory in (inside, *inside.parents):
+        if (name := _own_format(directory)) is not None:
+            raise UsageError(
+                f"{path} would be a part of {directory}, which is of format {name!r}",
+                possible="a path outside: a copy, a check or the end of retention takes the whole directory",
+                hint=str(directory.parent / path.name),
+            )
+
+
+def _own_format(directory: Path) -> str | None:
+    """Return the format of a directory that is a recording, video or calibration; None for any other."""
+    try:
+        name = read_object(directory / "zarr.json")["attributes"]["format"]
+    except (OSError, ValueError, LookupError, TypeError):
+        return None
+    return name if isinstance(name, str) and name.startswith("acquire-") else None
 
 
 def write_all(fd: int, parts: Sequence[Buffer], offset: int) -> None:

@@ -27,6 +27,13 @@ if TYPE_CHECKING:
 Kind = TypeVar("Kind", bound="Outline")
 
 
+_SHOWN_BY = {
+    "video": "acquire render, which shows videos",
+    "calibration": "acquire calibrate show, which shows calibrations",
+}
+"""Kinds of groups that are ours and no recordings, as their formats name them, and what shows them."""
+
+
 def opened(source: Source, kind: type[Kind]) -> Kind:
     """Open a source as a `Recording`, or as an `Outline`, which has no lines.
 
@@ -52,6 +59,13 @@ def opened(source: Source, kind: type[Kind]) -> Kind:
 def format_of(place: Path | str) -> str | None:
     """Return the format that a Zarr group states, if any. Raises as `read_root` does."""
     return _format(read_root(source_of(place)))
+
+
+def other_kind(name: str | None) -> str | None:
+    """Return what else of ours a group of this format is, in one word; None: a recording, or not ours."""
+    return next(
+        (kind for kind in _SHOWN_BY if name is not None and name.startswith(f"acquire-{kind}/")), None
+    )
 
 
 def read_root(source: Source) -> Document:
@@ -110,11 +124,11 @@ def _check_format(source: Source, name: str | None) -> None:
             possible=", ".join(map(repr, READABLE)),
             hint="a newer version of acquire",
         )
-    video = name is not None and name.startswith("acquire-video/")
+    kind = other_kind(name) or "Zarr group"
     raise PlaceError(
-        f"{source} is a {'video' if video else 'Zarr group'}, but not a recording: format {name!r}",
+        f"{source} is a {kind}, but not a recording: format {name!r}",
         possible=", ".join(map(repr, READABLE)),
-        hint="acquire render, which shows videos" if video else "the path of a recording",
+        hint=_SHOWN_BY.get(kind, "the path of a recording"),
     )
 
 

@@ -17,6 +17,7 @@ from acquire.clock import NS_PER_S
 from acquire.codes import code_from_attrs
 from acquire.errors import DataError, UsageError
 from acquire.flags import NO_IMAGE
+from acquire.geometry import check_integers
 from acquire.lines import ARMS, LineFlag, Segment
 from acquire.noise import Noise
 from acquire.showing import PICTURE_PX, as_picture, as_table, in_words
@@ -130,6 +131,7 @@ class Recording(Outline):
         there, and DataError if the file is damaged or the code recorded with the lines is not the one that
         the attributes describe.
         """
+        check_integers(first_line=first_line, lines=lines)
         # Users know lines by number, and not in which segment an outage has put them.
         if (segment := self._segment_with(first_line)) is not None:
             return segment.cut(first_line, lines, tile)
@@ -160,6 +162,7 @@ class Recording(Outline):
 
         All columns are included, whatever they see: for calibrations per column. Raises as `cut` does.
         """
+        check_integers(first_line=first_line, lines=lines)
         if (segment := self._segment_with(first_line)) is not None:
             return segment.whole_lines(first_line, lines)
         rows = self._rows(first_line, lines)

@@ -248,6 +248,12 @@ def _url_errors(url: str) -> Iterator[None]:
     try:
         yield
     except (ValueError, ImportError) as error:
+        if not is_url(url):
+            raise UsageError(
+                f"{url} is not a URL",
+                possible="file:///DIRECTORY, s3://BUCKET/…",
+                hint=Path(url).absolute().as_uri(),
+            ) from error
         raise UsageError(
             f"{url} cannot be opened: {error}",
             possible=f"{', '.join(OBJECT_STORES)}, file, memory and what else fsspec has a package for",

@@ -26,6 +26,8 @@ if TYPE_CHECKING:
     from acquire.clock import ClockFit
     from acquire.store.terms import Continuation, Retention
 
+TAG_BYTES = 8
+"""Bytes of the widest tag (code, times, flags), of which there is one per line."""
 CAMERA_KEYS = ("white_dn", "black_level_dn", "responsivity_dn")
 """Camera facts that a reader needs to convert DN into samples of Eq. (1)."""
 
@@ -182,14 +184,20 @@ class RecordingSpec:
             "encoders": (1, 64),
             "commit_lines": (1, 2**40),
             "reserve_bytes": (0, 2**60),
-            # 8 bytes: of the widest tag, of which there is one per line
-            "chunk_lines": (1, MAX_CHUNK_BYTES // max(8, self.pixels * self.line_dtype.itemsize)),
+            "chunk_lines": (1, MAX_CHUNK_BYTES // max(TAG_BYTES, self.pixels * self.line_dtype.itemsize)),
         }
         for name, (low, high) in limits.items():
             if not low <= getattr(self, name) <= high:
                 raise UsageError(
                     f"a recording cannot have {name} = {getattr(self, name)}", possible=f"{low} to {high}"
                 )
+        # Readers take such a chunk whole, and its lines are on disk only once all of them have come.
+        most = max(1, MAX_CHUNK_BYTES // (TAG_BYTES * self.chunk_lines))
+        if self.tag_chunks > most:
+            raise UsageError(
+                f"a recording cannot have tag_chunks = {self.tag_chunks} of {self.chunk_lines} lines",
+                possible=f"1 to {most}: {most * self.chunk_lines} lines in a chunk of tags",
+            )
         if self.shard_chunks % self.tag_chunks:
             raise UsageError(
                 f"a recording cannot have tag_chunks = {self.tag_chunks}",

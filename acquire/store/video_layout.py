@@ -96,6 +96,8 @@ class Window:
     high: float = -math.inf
     _kept: list[NDArray[Any]] = field(default_factory=list)
     _every: int = 1
+    # At random, but the same for the same video: even steps would take the same columns of every row.
+    _random: np.random.Generator = field(default_factory=lambda: np.random.default_rng(0))
 
     def add(self, frames: NDArray[Any]) -> None:
         """Take frames into account; memory stays bounded, however many come."""
@@ -104,11 +106,18 @@ class Window:
         if not finite.size:
             return
         self.low, self.high = min(self.low, float(finite.min())), max(self.high, float(finite.max()))
-        self._kept.append(finite[:: max(self._every, finite.size // KEPT)].copy())
+        self._kept.append(self._thinned(finite, max(self._every, finite.size // KEPT)))
         while sum(map(len, self._kept)) > 2 * KEPT:
             # Of later frames as few are taken, so that all count alike.
             self._every *= 2
-            self._kept = [np.concatenate(self._kept)[::2]]
+            self._kept = [self._thinned(np.concatenate(self._kept), 2)]
+
+    def _thinned(self, values: NDArray[Any], every: int) -> NDArray[Any]:
+        """Return a copy of one of ``every`` values, at least one of all."""
+        every = min(every, len(values))
+        count = len(values) // every
+        kept: NDArray[Any] = values[np.arange(count) * every + self._random.integers(0, every, count)]
+        return kept
 
     def to_omero(self, name: str, first_frame: int) -> dict[str, Any]:
         """Return the attribute ``omero``; ``first_frame`` is shown first."""

@@ -22,7 +22,7 @@ from acquire.processes.messages import Quit, Ready
 from acquire.processes.shared import Counters
 from acquire.processes.worker import Worker
 from acquire.stream import grabber, recorder, recorder_plan, recorder_states, watcher
-from acquire.stream.external_counts import TRIGGER, TRIGGER_COUNTERS, WATCHER
+from acquire.stream.external_counts import TAG_READER_COUNTERS, TRIGGER, TRIGGER_COUNTERS, WATCHER
 from acquire.stream.kept import Kept
 from acquire.stream.ledger import Counted, account
 from acquire.stream.lifecycle import MEANINGS, Stage
@@ -210,7 +210,7 @@ class Capture:
     def _make_memory(self) -> None:
         self._tags = Ring("tags", _TAG_RING)
         self._counters[RECORDER] = Counters(recorder_plan.COUNTERS)
-        self._counters[TRIGGER] = Counters(TRIGGER_COUNTERS)
+        self._counters[TRIGGER] = Counters(TRIGGER_COUNTERS + TAG_READER_COUNTERS)
         if self._plan.watch is not None:
             self._counters[WATCHER] = Counters(watcher.COUNTERS)
         for arm in ARMS:

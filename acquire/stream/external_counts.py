@@ -8,8 +8,10 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from acquire.clock import NS_PER_S
 from acquire.lines import ARMS
 from acquire.stream.grabber import CAMERA_CAUSES
+from acquire.stream.stalls import HELD_UP_S
 from acquire.stream.watcher import VERDICTS
 
 if TYPE_CHECKING:
@@ -18,6 +20,8 @@ if TYPE_CHECKING:
     from acquire.processes.shared import Counters
 
 TRIGGER, WATCHER = "trigger", "watcher"
+_LONGEST_HOLD_UP_S = 10.0
+"""Time after which the thread that passes tags on counts as stuck in its trigger's driver."""
 
 TRIGGER_COUNTERS = (
     *("pulses", "tags", "tags_missing", "tags_repeated", "tags_wrong", "tag_lost"),
@@ -25,6 +29,10 @@ TRIGGER_COUNTERS = (
 )
 """The trigger's statistics that the ledger needs: pulses issued; tags received, missing, repeated, wrong, and
 lost in the device; the cameras' strobes in answer to pulses, missed or unexpected."""
+
+TAG_READER_COUNTERS = ("turned_ns", "held_up_to_ns")
+"""By the monotonic clock: the latest turn of the owner's thread that passes tags on, and the end of its last
+hold-up; 0: not yet."""
 
 CAMERA_COUNTS = ("delivered", "preroll", "next_line", "reopened", *CAMERA_CAUSES)
 
@@ -59,6 +67,14 @@ class ExternalCounts:
             arm: {str(name): counted[name] for name in CAMERA_COUNTS if counted[name]}
             for arm, counted in self._cameras.items()
         }
+
+    def tags_pass_since_s(self, now_s: float) -> float:
+        """Return the monotonic time since which tags are passed on without a hold-up; ``now_s`` in one."""
+        if self._trigger is None or not self._trigger["turned_ns"]:
+            return 0.0
+        still_s = now_s - self._trigger["turned_ns"] / NS_PER_S
+        is_held_up = HELD_UP_S < still_s < _LONGEST_HOLD_UP_S
+        return now_s if is_held_up else self._trigger["held_up_to_ns"] / NS_PER_S
 
     def doubted(self) -> set[str]:
         """Return the arms whose lines contradict the code."""

@@ -57,7 +57,8 @@ class CapturePlan:
     goes_on : a recording that ended because the disk was too slow continues in a further segment
     seal_timeout_s : when the capture is closed, a recording of which nothing more reaches the disk for this
         long is given up, and left to be recovered
-    tag_wait_s : how long lines wait for the tag that confirms them, once it is due, before they are flagged
+    tag_wait_s : how long lines wait for the tag that confirms them, once it is due, before they are flagged;
+        the time in which the host kept the process waiting that passes tags on does not count
     reopen_timeout_s : how long a camera that is gone is waited for; less than ``stall_timeout_s``, or the
         arm counts as stalled first
     line_period_ns : line period by the trigger's clock; 0: unknown

@@ -454,7 +454,8 @@ class Recorder:
             return True
         # Once one block has waited in vain, those after it do not wait at all until a tag comes again.
         now_s = time.monotonic()
-        waited_s = now_s - max(block.time_ns / 1e9, self._hold_ups.over_s)
+        over_s = max(self._hold_ups.over_s, self._external.tags_pass_since_s(now_s))
+        waited_s = now_s - max(block.time_ns / 1e9, over_s)
         is_pressing = 2 * ring.fill > ring.shape.slots and now_s > self._hold_ups.over_s + HELD_UP_S
         if waited_s > self._plan.tag_wait_s or is_pressing:
             self._waited_in_vain_for = self._tagger.confirmed_end

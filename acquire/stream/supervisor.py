@@ -10,6 +10,7 @@ import time
 from collections import deque
 from typing import TYPE_CHECKING
 
+from acquire.clock import NS_PER_S
 from acquire.errors import AcquireError, DeviceError, TriggerError
 from acquire.lines import ARMS
 from acquire.processes.messages import Failed, Ready
@@ -17,7 +18,7 @@ from acquire.stream.external_counts import TRIGGER, TRIGGER_COUNTERS, WATCHER
 from acquire.stream.lifecycle import UNDER_WAY, Lifecycle, Stage
 from acquire.stream.losses import Cause
 from acquire.stream.messages import Began, Cancel, Checked, End, Extend, Interrupt, Note, Refused, Sealed
-from acquire.stream.stalls import Excess, Heartbeat
+from acquire.stream.stalls import Excess, Heartbeat, HoldUps
 from acquire.stream.succession import Succession, replacement_note
 from acquire.stream.tagger import tag_rows
 from acquire.trigger.base import WATCHDOG
@@ -78,6 +79,7 @@ class Supervisor:
         margin, limit_s = plan.margin_lines, plan.stall_timeout_s
         self._excess = {arm: Excess(counters[arm], margin, limit_s) for arm in ARMS if margin is not None}
         self._counters = counters
+        self._hold_ups = HoldUps()
         self._query_s = 0.0
         self._newest_pulse: int | None = None
         self._trigger_lost = False
@@ -222,6 +224,7 @@ class Supervisor:
         try:
             while not self._ending.is_set():
                 begun = self._turned_s = time.monotonic()
+                self._show_turn(begun)
                 tags = self._take_tags()
                 self._query_trigger(begun)
                 for name, worker in self._workers.items():  # a successor only replaces the value of a key
@@ -240,6 +243,12 @@ class Supervisor:
                     self._ending.wait(max(0.0, begun + _TAG_WAIT_S - time.monotonic()))
         except Exception as error:  # noqa: BLE001 - the outermost boundary of the thread: reported as a fault
             self._fail(f"supervisor: {type(error).__name__}: {error}")
+
+    def _show_turn(self, now_s: float) -> None:
+        """Publish that tags are passed on: lines must not be flagged because this process was held up."""
+        self._hold_ups.update()
+        self._counters[TRIGGER]["held_up_to_ns"] = round(self._hold_ups.over_s * NS_PER_S)
+        self._counters[TRIGGER]["turned_ns"] = round(now_s * NS_PER_S)
 
     def _take_tags(self) -> list[LineTag]:
         if self._trigger_lost:

@@ -13,6 +13,7 @@ from acquire.errors import TriggerError
 from acquire.trigger import registers as r
 from acquire.trigger.registers import Command, EndReason, State
 from acquire.trigger.settings import Capabilities
+from acquire.trigger.tags import signed_ticks
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
@@ -110,14 +111,31 @@ class Device:
             busy=bool(flags["busy"]),
         )
 
-    def await_status(self, done: Callable[[DeviceStatus], bool], limit_s: float, what: str) -> DeviceStatus:
-        """Poll until ``done``. Raises TriggerError if the device did not do ``what`` in time."""
-        deadline_s = time.monotonic() + limit_s
+    def await_status(
+        self, done: Callable[[DeviceStatus], bool], limit_s: float, what: str, ticks: int = 0
+    ) -> DeviceStatus:
+        """Poll until ``done``. Raises TriggerError if the device did not do ``what`` in time.
+
+        ``ticks`` : by the device's clock, ``what`` may take so long; ``limit_s`` counts after that. The time
+        of a simulated device may pass more slowly than the host's.
+        """
+        begun_s = time.monotonic()
+        deadline_s = begun_s + limit_s
+        begun = seen = self.read(r.TIME) if ticks else 0
         while not done(status := self.status()):
             if time.monotonic() > deadline_s:
-                raise TriggerError(f"the trigger did not {what} within {limit_s:.3g} s: {status}")
+                now = self.read(r.TIME) if ticks else 0
+                # A clock that stands still says nothing: without this, a device that lost it is waited for.
+                if now == seen or signed_ticks(seen - begun) > ticks:
+                    given_s = deadline_s - begun_s
+                    raise TriggerError(f"the trigger did not {what} within {given_s:.3g} s: {status}")
+                seen, deadline_s = now, time.monotonic() + limit_s
             time.sleep(_LOOK_AGAIN_S)
         return status
+
+    def line_ticks(self) -> int:
+        """Return the length of a line as the device is configured, whoever did it."""
+        return int(r.LINE.substeps.of(self.read(r.LINE)) * self.read(r.SUBSTEP_CLOCKS))
 
     def counters(self) -> dict[str, int]:
         """Return counters of this run, or since power-up: see the registers."""

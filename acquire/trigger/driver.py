@@ -184,9 +184,8 @@ class TriggerDriver:
             # 0, any run: a device that was restarted in the meantime would refuse to stop one that it lacks.
             device.command(Command.STOP, 0)
             # The device ends after a whole line, which may take longer than any answer.
-            period_ticks = run.line_period_ticks if run else 0
-            limit_s = ANSWER_S + period_ticks / device.capabilities.clock_hz
-            status = device.await_status(lambda status: status.at_rest, limit_s, "end")
+            ticks = device.line_ticks()
+            status = device.await_status(lambda status: status.at_rest, ANSWER_S, "end", ticks)
             self._owed = 0
             device.link.interrupt()
             with self._stopped:

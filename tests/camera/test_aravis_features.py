@@ -7,11 +7,14 @@ import os
 import socket
 import time
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
 from gige_helpers import WAIT_S, open_in_time, our_camera, spec_at
+from waiting import until
 
+from acquire.camera import settings
 from acquire.camera.aravis import FAKE, AravisCamera, AravisOpener, load
 from acquire.camera.aravis.stream import RECEIVE_BYTES
 from acquire.camera.settings import Setting, apply_settings
@@ -26,7 +29,18 @@ PUBLISHED = """
   <pFeature>AcquisitionFrameRateConverter</pFeature> <pFeature>GainInHalves</pFeature>
   <pFeature>PeriodInMs</pFeature> <pFeature>PayloadSize</pFeature> <pFeature>LowGainBits</pFeature>
   <pFeature>GainRawRegister</pFeature> <pFeature>PlainRegister</pFeature>
+  <pFeature>LoadSettings</pFeature> <pFeature>LoadRegister</pFeature> <pFeature>Forget</pFeature>
 </Category>
+<Command Name="LoadSettings"> <pValue>LoadRegister</pValue> <CommandValue>7</CommandValue> </Command>
+<IntReg Name="LoadRegister">
+  <Address>0x110</Address> <Length>4</Length> <AccessMode>RW</AccessMode> <pPort>Device</pPort>
+  <Cachable>NoCache</Cachable> <Sign>Unsigned</Sign> <Endianess>BigEndian</Endianess>
+</IntReg>
+<Command Name="Forget"> <pValue>ForgetRegister</pValue> <CommandValue>7</CommandValue> </Command>
+<IntReg Name="ForgetRegister">
+  <Address>0x110</Address> <Length>4</Length> <AccessMode>WO</AccessMode> <pPort>Device</pPort>
+  <Cachable>NoCache</Cachable> <Sign>Unsigned</Sign> <Endianess>BigEndian</Endianess>
+</IntReg>
 <IntConverter Name="GainInHalves">
   <FormulaTo>FROM / 2</FormulaTo> <FormulaFrom>TO * 2</FormulaFrom> <pValue>GainRaw</pValue>
 </IntConverter>
@@ -110,6 +124,32 @@ def test_what_only_computes_is_read_and_is_refused_with_what_it_reads(described:
         match="PlainRegister = 3: the feature cannot have this value; possible: nothing that can be",
     ):
         apply(described, ("remote", "PlainRegister", 3))
+
+
+def test_a_command_is_waited_for_until_the_camera_has_carried_it_out(
+    described: AravisCamera, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Loading settings takes a camera a while, and overwrites what was set in the meantime."""
+
+    def carry_out() -> None:
+        node = described.features()["remote"].find("LoadRegister")
+        assert node is not None
+        until(lambda: node.read() == 7, "the command")
+        time.sleep(0.3)
+        node.write(0)
+
+    apply(described, ("remote", "LoadRegister", 0))
+    with ThreadPoolExecutor(1) as camera:
+        carried_out = camera.submit(carry_out)
+        apply(described, ("remote", "LoadSettings", True))
+        assert read(described, "LoadRegister") == 0
+        carried_out.result()
+    monkeypatch.setattr(settings, "COMMAND_S", 0.1)
+    with pytest.raises(CameraError, match=r"LoadSettings is not done after 0\.1 s; possible: .*; try: the"):
+        apply(described, ("remote", "LoadSettings", True))
+    apply(described, ("remote", "Forget", True))  # its register cannot be read: nothing to wait for
+    assert read(described, "LoadRegister") == 7
+    apply(described, ("remote", "LoadRegister", 0))
 
 
 @pytest.fixture(scope="module")

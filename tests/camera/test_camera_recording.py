@@ -98,7 +98,7 @@ def check_lines(config: RigConfig, recording: Recording, arm: str) -> np.ndarray
 def test_what_is_recorded_through_the_producer_is_eq1(tmp_path: Path) -> None:
     config = rig_config()
     recording, status = record(config, tmp_path / "r.zarr", 5000)
-    assert status.condition is RunCondition.GOOD
+    assert status.condition is RunCondition.GOOD, status.ledger
     for arm in "ab":
         assert not check_lines(config, recording, arm).any()
         camera = recording.attrs["cameras"][arm]

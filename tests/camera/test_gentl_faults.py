@@ -20,6 +20,7 @@ from acquire.camera.settings import Setting
 from acquire.camera.spec import GenicamSpec
 from acquire.errors import CameraError, CameraLostError, PlaceError, UsageError
 from acquire.lines import LineFlag
+from acquire.sim.gentl import layout
 from acquire.sim.gentl.bench import GentlBench
 from acquire.sim.gentl.build import build
 from acquire.sim.gentl.memory import CameraMemory
@@ -310,6 +311,89 @@ def test_a_camera_can_be_opened_while_others_look_at_it(bench: GentlBench) -> No
         looking.kill()
         looking.communicate()
         assert producer.IFClose(card) == producer.TLClose(system) == producer.GCCloseLib() == 0
+
+
+class Raw:
+    """A camera through the producer's own functions, as a host that restarts it without its stream."""
+
+    def __init__(self, cti: Path, serial: str) -> None:
+        self.producer = ctypes.CDLL(str(cti))
+        self.system, self.card, self.device, self.remote, self.stream, self.event = (
+            ctypes.c_void_p() for _ in range(6)
+        )
+        self.call("GCInitLib")
+        self.call("TLOpen", ctypes.byref(self.system))
+        self.call("TLOpenInterface", self.system, b"card0", ctypes.byref(self.card))
+        self.call("IFOpenDevice", self.card, serial.encode(), 4, ctypes.byref(self.device))
+        self.call("DevGetPort", self.device, ctypes.byref(self.remote))
+        self.call("DevOpenDataStream", self.device, b"Stream0", ctypes.byref(self.stream))
+        self.call("GCRegisterEvent", self.stream, 1, ctypes.byref(self.event))
+
+    def call(self, name: str, *arguments: Any) -> None:
+        assert getattr(self.producer, name)(*arguments) == 0, name
+
+    def set(self, port: ctypes.c_void_p, name: str, value: int) -> None:
+        at, word = ctypes.c_uint64(layout.REGISTERS[name]), ctypes.c_uint64(value)
+        self.call("GCWritePort", port, at, ctypes.byref(word), ctypes.byref(ctypes.c_size_t(8)))
+
+    def start(self, buffers: int, size: int) -> None:
+        for _ in range(buffers):
+            buffer = ctypes.c_void_p()
+            self.call(
+                "DSAllocAndAnnounceBuffer", self.stream, ctypes.c_size_t(size), None, ctypes.byref(buffer)
+            )
+            self.call("DSQueueBuffer", self.stream, buffer)
+        self.call("DSStartAcquisition", self.stream, 0, ctypes.c_uint64(0))
+        self.set(self.remote, "AcquisitionStart", 1)
+
+    def frame(self) -> dict[str, int]:
+        """Facts of the next frame, whose buffer is queued again."""
+        data, size = (ctypes.c_void_p * 2)(), ctypes.c_size_t(16)
+        self.call("EventGetData", self.event, data, ctypes.byref(size), ctypes.c_uint64(60_000))
+        found = {}
+        for name, info in (("time_ns", 3), ("offset", 12), ("id", 16)):
+            value = ctypes.c_uint64()
+            arguments = ctypes.c_int32(), value, ctypes.c_size_t(8)
+            self.call(
+                "DSGetBufferInfo", self.stream, ctypes.c_void_p(data[0]), info, *map(ctypes.byref, arguments)
+            )
+            found[name] = value.value
+        self.call("DSQueueBuffer", self.stream, ctypes.c_void_p(data[0]))
+        return found
+
+    def close(self) -> None:
+        self.call("DevClose", self.device)
+        self.call("IFClose", self.card)
+        self.call("TLClose", self.system)
+        self.call("GCCloseLib")
+
+
+def test_a_camera_that_is_started_again_delivers_no_line_of_before() -> None:
+    """The stream had not taken them all yet, and the first frame after the start was of before."""
+    width = 2048
+    model = CameraModel("SIM-R", width, line_rate_hz=50_000.0)
+    with GentlBench({model: RampOpener(50_000.0, width=width)}) as bench:
+        raw = Raw(bench.cti, model.serial)
+        try:
+            raw.set(raw.remote, "PixelFormat", layout.PIXEL_FORMATS["Mono10p"][0])  # slow to pack
+            raw.set(raw.remote, "Width", width - 8)
+            raw.set(raw.remote, "OffsetX", 8)
+            raw.start(8, 256 * width * 2)
+            assert raw.frame()["id"] == 0
+            memory = bench.cameras[model.serial]
+            for _ in range(3):
+                deadline = time.monotonic() + WAIT_S
+                while memory["HEAD"] - memory["TAIL"] < 500:
+                    assert time.monotonic() < deadline, "the stream is too fast to be behind"
+                    assert raw.frame()["offset"] == 8
+                raw.set(raw.remote, "AcquisitionStop", 1)
+                started_ns = time.monotonic_ns()
+                raw.set(raw.remote, "AcquisitionStart", 1)
+                while (frame := raw.frame())["id"]:
+                    pass
+                assert frame["time_ns"] > started_ns
+        finally:
+            raw.close()
 
 
 def test_a_cache_that_cannot_be_written_is_named(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

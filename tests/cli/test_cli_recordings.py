@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import zarr
 
 from acquire.cli.recording_page import CELL_CHARACTERS
 from acquire.clock import ClockFit
@@ -136,6 +137,29 @@ def test_ls_leaves_videos_out(cli: Cli, recording: Path) -> None:
     video, times = np.zeros((2, 4, 4), np.float32), np.arange(2, dtype=np.int64)
     write_video(recording.parent / "a-video.zarr", video, times, 1.0, 1e4, {})
     assert [Path(item["path"]).name for item in cli("ls", recording.parent, "--json").json] == ["one.zarr"]
+
+
+def test_ls_says_what_else_there_is_and_what_shows_it(cli: Cli, tmp_path: Path) -> None:
+    """It said that there were no recordings "in" a video, and listed a calibration as a damaged recording."""
+    video, times = np.zeros((2, 4, 4), np.float32), np.arange(2, dtype=np.int64)
+    for name in ("one.zarr", "two.zarr"):
+        write_video(tmp_path / name, video, times, 1.0, 1e4, {})
+    zarr.create_group(tmp_path / "c.zarr", zarr_format=3, attributes={"format": "acquire-calibration/1"})
+    listed = cli("ls", tmp_path)
+    assert (listed.code, listed.out) == (
+        0,
+        f"there are no recordings in {tmp_path}, but 1 calibration, 2 videos\n",
+    )
+    assert cli("ls", tmp_path, "--json").json == []
+    for name, kind, shows in (
+        ("one.zarr", "video", "acquire render, which shows videos"),
+        ("c.zarr", "calibration", "acquire calibrate show, which shows calibrations"),
+    ):
+        for command in ("ls", "info", "verify", "diagnose"):
+            answer = cli(command, tmp_path / name)
+            assert answer.code == 2
+            assert f"{name} is a {kind}, but not a recording" in answer.err
+            assert f"try: {shows}" in answer.err
 
 
 def test_ls_of_a_link_to_nowhere_and_of_a_recording_itself(cli: Cli, recording: Path) -> None:
@@ -366,3 +390,11 @@ def test_foreign_text_is_escaped_before_it_reaches_a_terminal(cli: Cli, recordin
     answer = cli("info", odd, "--json")
     assert answer.code == 0, answer.err
     assert answer.json["end_reason"] == HOSTILE
+
+
+def test_a_path_as_the_target_of_an_upload_is_told_its_url(cli: Cli, recording: Path, tmp_path: Path) -> None:
+    """The advice was to install a package for the protocol ./copy.zarr."""
+    answer = cli("upload", recording, str(tmp_path / "copy.zarr"))
+    assert answer.code == 2
+    assert "copy.zarr is not a URL; possible: file:///" in answer.err.replace("\n  ", "; ")
+    assert f"try: file://{tmp_path}/copy.zarr" in answer.err

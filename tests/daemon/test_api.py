@@ -21,8 +21,9 @@ from served import api
 from acquire.client import AsyncClient, Client, News, State, core
 from acquire.daemon import stream
 from acquire.daemon.endpoint import Endpoint
-from acquire.daemon.facts import API_VERSION
-from acquire.daemon.messages import error_body
+from acquire.daemon.facts import API_VERSION, Reloaded
+from acquire.daemon.local import Local
+from acquire.daemon.messages import CapacityStatus, error_body
 from acquire.daemon.service import Service
 from acquire.errors import AcquireError, NoDaemonError, StateError, UsageError
 
@@ -75,6 +76,33 @@ def test_who_gave_a_command_is_in_the_log_and_in_the_recording(
     assert [call for call in run.calls if call[:2] == ("note", "operator")] == [
         ("note", "operator", "start by operator at 10.0.0.7")
     ]
+
+
+@pytest.mark.parametrize("command", ["capacity", "reload"])
+def test_a_measurement_and_a_reload_that_come_again_are_carried_out_once(
+    path: Path, daemon: Client, monkeypatch: pytest.MonkeyPatch, command: str
+) -> None:
+    times: list[str] = []
+
+    async def reload(self: Local) -> Reloaded:
+        times.append("reload")
+        return Reloaded(file=f"{len(times)}.toml", changed=[])
+
+    async def measure(self: Local) -> CapacityStatus:
+        times.append("capacity")
+        return CapacityStatus(line_rate_hz=len(times))
+
+    monkeypatch.setattr(Local, "reload", reload)
+    monkeypatch.setattr(Local, "measure", measure)
+    with raw_client(path) as raw:
+        one, again, other = (
+            raw.post(f"/{command}", headers={"Request-Id": name}) for name in ("one", "one", "two")
+        )
+        assert (one.status_code, one.text) == (again.status_code, again.text)
+        assert other.text != one.text
+        assert times == [command, command]
+        refused = raw.post("/disarm", headers={"Request-Id": "one"})
+        assert "given to another request" in refused.text
 
 
 def test_request_ids_are_bounded(path: Path, daemon: Client) -> None:

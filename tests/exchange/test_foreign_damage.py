@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -94,3 +96,42 @@ def test_a_numpy_file_in_fortran_order_is_read_and_may_be_cut_short(
             file.truncate(path.stat().st_size // 2)
         with pytest.raises(DataError, match="ends before line 3000: it was cut short"):
             found.rows(0 if arms else None, 100, 3000)
+
+
+CUT_SHORT = """
+import os, sys
+from pathlib import Path
+from acquire.errors import UsageError
+from acquire.exchange import code_words
+
+kept = code_words.mapped
+
+def mapped_and_cut(path):
+    found = kept(path)
+    os.truncate(path, 128)
+    return found
+
+code_words.mapped = mapped_and_cut
+try:
+    code_words.parse_code("bits:" + sys.argv[1])
+except UsageError as error:
+    print(error)
+"""
+
+
+def test_a_code_whose_file_is_cut_short_meanwhile_is_an_error_and_no_crash(tmp_path: Path) -> None:
+    path = tmp_path / "code.npy"
+    np.save(path, np.ones(20_000, np.uint8))
+    done = subprocess.run(
+        [sys.executable, "-c", CUT_SHORT, str(path)], capture_output=True, text=True, timeout=60, check=False
+    )
+    assert done.returncode == 0, done
+    assert "code.npy was changed while it was read; try: again" in done.stdout
+
+
+def test_a_code_is_its_own_once_it_is_read(tmp_path: Path) -> None:
+    path = tmp_path / "code.npy"
+    np.save(path, np.array([1, 0, 1, 1], np.uint8))
+    code = parse_code(f"bits:{path}")
+    path.write_bytes(b"")
+    assert code.bits(0, 4).tolist() == [1, 0, 1, 1]

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -105,6 +107,28 @@ def test_both_solvers_find_the_same_minimum(small: Small) -> None:
     assert found == pytest.approx(small.objective(twist.theta, weight), rel=1e-3)
     nudged = admm.theta + 1e-2 * np.random.default_rng(4).standard_normal(small.shape)
     assert found < small.objective(nudged, weight)
+
+
+@pytest.mark.parametrize("how", ["reweigh", "resume"])
+def test_a_minimum_stays_one_with_other_penalties(small: Small, how: str) -> None:
+    """Penalties are no part of Eq. (5): w, the residual divided by them, was left as it was."""
+    first = AdmmParameters(tv_weight=0.02, tv_penalty=0.1, sign_penalty=0.03, tv_iterations=60)
+    other = replace(first, tv_penalty=0.02, sign_penalty=0.006)
+    admm = Admm(small.operator, small.samples, small.shape, small.basis, first)
+    for _ in range(1500):
+        admm.step()
+    found = admm.theta.copy()
+    if how == "reweigh":
+        admm.reweigh(other)
+    else:
+        # the dual field of total variation is the denoiser's, which the trials of a search may share
+        resumed = Admm(small.operator, small.samples, small.shape, small.basis, other)
+        resumed._denoiser = admm._denoiser
+        resumed.resume(admm)
+        admm = resumed
+    for _ in range(3):
+        admm.step()
+        assert np.abs(admm.theta - found).max() < 1e-6 * np.abs(found).max()
 
 
 def test_samples_that_are_not_finite_stop_the_solvers(small: Small) -> None:

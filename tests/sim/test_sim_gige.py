@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import itertools
 import os
 import socket
 import struct
+from collections.abc import Iterator
+from contextlib import contextmanager
 
 import numpy as np
 
 from acquire.camera.base import CameraBlock
-from acquire.sim.gentl.layout import REGISTERS
+from acquire.sim.gentl.layout import PIXEL_FORMATS, REGISTERS
 from acquire.sim.gentl.models import CameraModel
 from acquire.sim.gige import protocol
 from acquire.sim.gige.camera import GigeCamera, Transmission
@@ -53,25 +56,91 @@ class Tap:
         return []
 
 
-def write(host: socket.socket, camera: GigeCamera, address: str, name: str, value: int) -> None:
-    """Set a register as a host does, and wait for the answer."""
-    body = struct.pack(">I", protocol.BOOTSTRAP_BYTES + REGISTERS[name]) + struct.pack("<Q", value)
-    header = struct.pack(">BBHHH", protocol.KEY, 1, protocol.Command.WRITE_MEMORY, len(body), 1)
-    host.sendto(header + body, (address, protocol.PORT))
+_numbers = itertools.count(1)
+
+
+def ask(
+    host: socket.socket, camera: GigeCamera, address: str, command: int, body: bytes
+) -> tuple[int, bytes]:
+    """Send a command as a host does; return the status and the body of the answer."""
+    number = next(_numbers)
+    host.sendto(
+        struct.pack(">BBHHH", protocol.KEY, 1, command, len(body), number) + body, (address, protocol.PORT)
+    )
     camera.turn()
-    assert host.recv(64)[2:4] == struct.pack(">H", protocol.Command.WRITE_MEMORY + 1)
+    reply = host.recv(1024)
+    status, answered, length, of = struct.unpack_from(">HHHH", reply)
+    assert (answered, of, length) == (command + 1, number, len(reply) - 8)
+    return status, reply[8:]
 
 
-def test_frames_have_the_time_of_their_first_line_also_after_lost_lines() -> None:
-    address, tap = f"127.{1 + os.getpid() // 256 % 254}.{os.getpid() % 256}.40", Tap()
-    model = CameraModel("OURS", WIDTH, pixel_format="Mono12")
+def write(host: socket.socket, camera: GigeCamera, address: str, name: str, value: int) -> int:
+    body = struct.pack(">I", protocol.BOOTSTRAP_BYTES + REGISTERS[name]) + struct.pack("<Q", value)
+    return ask(host, camera, address, protocol.Command.WRITE_MEMORY, body)[0]
+
+
+def read(host: socket.socket, camera: GigeCamera, address: str, name: str) -> int:
+    body = struct.pack(">IHH", protocol.BOOTSTRAP_BYTES + REGISTERS[name], 0, 8)
+    status, answer = ask(host, camera, address, protocol.Command.READ_MEMORY, body)
+    assert status == 0
+    return struct.unpack_from("<Q", answer, 4)[0]
+
+
+@contextmanager
+def bench(at: int, tap: Tap, width: int = WIDTH) -> Iterator[tuple[socket.socket, GigeCamera, str]]:
+    address = f"127.{1 + os.getpid() // 256 % 254}.{os.getpid() % 256}.{at}"
+    model = CameraModel("OURS", width, pixel_format="Mono12")
     with (
         GigeCamera(model, LossySensor(), address, Transmission(link=tap)) as camera,
         socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as host,
     ):
         host.settimeout(60)
+        yield host, camera, address
+
+
+BAD_VALUES = [("PixelFormat", 12345), ("PixelFormat", PIXEL_FORMATS["Mono12p"][0])]
+BAD_VALUES += [("Width", 0), ("Width", WIDTH + 1), ("OffsetX", 1), ("Height", 0)]
+
+
+def test_values_that_no_line_can_be_sent_with_are_refused_and_change_nothing() -> None:
+    """One of them ended the camera's process, another left it in an endless loop."""
+    tap = Tap()
+    with bench(41, tap) as (host, camera, address):
+        for name, value in BAD_VALUES:
+            before = read(host, camera, address, name)
+            assert write(host, camera, address, name, value) == protocol.Status.INVALID_PARAMETER
+            assert read(host, camera, address, name) == before
+        beyond = struct.pack(">IHH", 1 << 30, 0, 8)
+        for command, body, status in (
+            (protocol.Command.READ_MEMORY, beyond, protocol.Status.INVALID_ADDRESS),
+            (protocol.Command.WRITE_MEMORY, beyond, protocol.Status.INVALID_ADDRESS),
+            (protocol.Command.READ_REGISTER, beyond[:4], protocol.Status.INVALID_ADDRESS),
+            (protocol.Command.WRITE_REGISTER, beyond, protocol.Status.INVALID_ADDRESS),
+            (protocol.Command.WRITE_REGISTER, b"", protocol.Status.INVALID_PARAMETER),
+        ):
+            assert ask(host, camera, address, command, body) == (status, b"")
+        assert write(host, camera, address, "Height", HEIGHT) == 0
+        assert write(host, camera, address, "AcquisitionStart", 1) == 0
+        while not tap.frames:
+            camera.turn()
+
+
+def test_a_frame_states_the_column_at_which_its_lines_begin() -> None:
+    tap = Tap()
+    with bench(42, tap) as (host, camera, address):
+        for name, value in (("Width", 4), ("OffsetX", 3), ("Height", HEIGHT), ("AcquisitionStart", 1)):
+            assert write(host, camera, address, name, value) == 0
+        while not tap.frames:
+            camera.turn()
+    _, _, _, _, width, height, offset, *_ = struct.unpack_from(">HHQIIIIIHH", tap.frames[0][0], 8)
+    assert (width, height, offset) == (4, HEIGHT, 3)
+
+
+def test_frames_have_the_time_of_their_first_line_also_after_lost_lines() -> None:
+    tap = Tap()
+    with bench(40, tap) as (host, camera, address):
         for name, value in (("Width", WIDTH), ("Height", HEIGHT), ("AcquisitionStart", 1)):
-            write(host, camera, address, name, value)
+            assert write(host, camera, address, name, value) == 0
         while len(tap.frames) < 12:
             camera.turn()
     seen: list[int] = []

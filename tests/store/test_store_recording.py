@@ -23,6 +23,7 @@ from acquire import store
 from acquire.errors import DataError, PlaceError, StoreError, UsageError
 from acquire.lines import ARMS, LineFlag
 from acquire.store import FORMAT, Event, Gap, RecordingWriter, RunCondition, open_recording, verify
+from acquire.store.files import check_new_path
 
 
 @pytest.fixture
@@ -297,6 +298,21 @@ def test_what_cannot_be_a_path_is_refused(tmp_path, name):
     assert not any(tmp_path.iterdir())
 
 
+def test_nothing_is_created_within_a_recording_but_beside_it_and_within_other_groups(path, tmp_path):
+    """A video that was written into its recording went with every copy of it, and with its deletion."""
+    writer = RecordingWriter.create(path, make_spec())
+    writer.seal(RunCondition.GOOD, "stopped", {})
+    (tmp_path / "link").symlink_to(path / "a")
+    for inner in (path / "v.zarr", path / "a" / "v.zarr", tmp_path / "link" / "v.zarr"):
+        with pytest.raises(
+            UsageError, match=r"would be a part of .*; possible: a path outside.*; try: .*v\.zarr"
+        ):
+            check_new_path(inner)
+    zarr.create_group(tmp_path / "mine.zarr", zarr_format=3, attributes={"format": "mine"})
+    for beside in (tmp_path / "v.zarr", tmp_path / "mine.zarr" / "v.zarr"):
+        check_new_path(beside)
+
+
 @pytest.mark.parametrize(
     ("number", "kind"),
     [
@@ -361,6 +377,13 @@ def test_a_disk_that_refuses_the_beginning_leaves_nothing_behind(path):
 def test_specs_that_cannot_be_recorded_are_refused(wrong):
     with pytest.raises(UsageError):
         make_spec(**wrong)
+
+
+def test_a_chunk_of_tags_that_no_reader_would_take_is_refused():
+    """255 chunks of 2**20 lines: 2 GB of ticks in one piece, of which no line was readable before all."""
+    with pytest.raises(UsageError, match=r"tag_chunks = 252 of 1048576 lines; possible: 1 to 8: 8388608 lin"):
+        make_spec(chunk_lines=2**20, shard_chunks=252, tag_chunks=252)
+    make_spec(chunk_lines=2**20, shard_chunks=248, tag_chunks=8)
 
 
 def test_a_ledger_that_is_not_json_is_refused_before_the_end(path):

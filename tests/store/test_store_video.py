@@ -274,3 +274,20 @@ def test_a_pipe_in_the_place_of_a_video_keeps_nobody_waiting(tmp_path):
     os.mkfifo(tmp_path / "v.zarr" / "zarr.json")
     with pytest.raises(DataError, match="it is a pipe, not a file"):
         open_video(tmp_path / "v.zarr")
+
+
+@pytest.mark.parametrize("times", [1, 40])
+def test_black_and_white_are_those_of_all_columns(times: int) -> None:
+    """Every 64th voxel of rows of 64 was one of the first column, and every other one of a half."""
+    window = video_layout.Window()
+    frames = np.zeros((1024, 64, 64), np.float32)
+    frames[:, :, 1::2] = 1.0
+    frames[:, :, 20] = 3.0
+    for _ in range(times):
+        window.add(frames)
+    shown = window.to_omero("video", 0)["channels"][0]["window"]
+    assert (shown["start"], shown["end"]) == (0.0, 3.0)
+    assert sum(map(len, window._kept)) <= 2 * video_layout.KEPT
+    kept = np.concatenate(window._kept)
+    assert np.mean(kept == 1.0) == pytest.approx(0.5, abs=0.01)
+    assert np.mean(kept == 3.0) == pytest.approx(1 / 64, abs=0.003)

@@ -396,6 +396,20 @@ def test_lines_wait_for_a_tag_that_is_not_due_yet(tmp_path: Path) -> None:
     assert (status.condition, status.ledger["tainted_by"]) == (RunCondition.GOOD, {})
 
 
+def test_lines_wait_for_tags_that_this_process_is_too_busy_to_pass_on(tmp_path: Path) -> None:
+    """At a load of six, the process that reads the trigger stood still longer than lines wait for tags."""
+    bench = make_bench(tag_wait_s=0.5)
+    with armed(bench) as capture:
+        record_until(capture, tmp_path / "r.zarr", 1000)
+        bench.trigger.hold_up_s = 1.0
+        until(lambda: not bench.trigger.hold_up_s, "the hold-up")
+        lines = capture.poll().recorded_lines
+        until(lambda: capture.poll().recorded_lines > lines + 1000, "lines after it")
+        capture.stop()
+        status = sealed(capture)
+    assert (status.condition, status.ledger["tainted_by"]) == (RunCondition.GOOD, {})
+
+
 def test_tags_that_contradict_the_lines_taint_the_recording(tmp_path: Path) -> None:
     bench = make_bench(tag_wait_s=0.05)
     with armed(bench) as capture:

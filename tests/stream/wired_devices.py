@@ -131,12 +131,16 @@ class CountingCamera:
 
 
 class WireTrigger:
-    """Issues pulses at ``rate_hz``, whatever the run's ticks say. ``mute``: no tags; ``refuse``: no run."""
+    """Issues pulses at ``rate_hz``, whatever the run's ticks say.
+
+    ``mute``: no tags; ``refuse``: no run; ``hold_up_s``: how long the next wait for tags takes.
+    """
 
     def __init__(self, wire: Counters, rate_hz: float) -> None:
         self.wire = wire
         self.rate_hz = rate_hz
         self.mute = self.refuse = False
+        self.hold_up_s = 0.0
         self.broken: Exception | None = None
         self.shift = 0
         self.told: list[TagEvent] = []
@@ -161,7 +165,8 @@ class WireTrigger:
             raise self.broken
         if self.mute or self.wire["stop_ns"]:
             return []
-        time.sleep(timeout_s / 4)
+        held_s, self.hold_up_s = self.hold_up_s, 0.0
+        time.sleep(held_s or timeout_s / 4)
         end = issued(self.wire, self.rate_hz)
         lines = range(self._next, end, self.run.tag_every_lines)
         self._next += len(lines) * self.run.tag_every_lines

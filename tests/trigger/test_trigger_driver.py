@@ -9,6 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from trigger_twins import CLOCK_HZ, CODE, run, wired_model
 
+import acquire.trigger.driver
 from acquire.codes import code_from_attrs
 from acquire.config.device import TriggerConfig
 from acquire.errors import TriggerError
@@ -172,6 +173,41 @@ def test_simulated_time_runs_fast_and_the_fit_holds_at_the_start() -> None:
     driver.stop()
     driver.close()
     wire.close()
+
+
+def test_a_stop_waits_for_the_end_of_a_line_by_the_devices_clock_whoever_started_it(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """The limit was a time of the host's, and without the line of a run that another program started."""
+    monkeypatch.setattr(acquire.trigger.driver, "ANSWER_S", 0.3)
+    wire = Wire()
+    model = TriggerModel(wire, CLOCK_HZ, speed=2e-5)  # a line of 30 us takes 1.5 s
+    driver, another = driver_of(model), driver_of(model)
+    driver.prepare(run())
+    driver.start()
+    begin = time.monotonic()
+    another.identify()
+    assert another.stop() == 1
+    assert time.monotonic() - begin > 1.0
+    another.close()
+    driver.close()
+    wire.close()
+
+
+def test_a_stop_does_not_wait_for_a_device_whose_clock_stands_still(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(acquire.trigger.driver, "ANSWER_S", 0.2)
+    with wired_model() as model:
+        driver = driver_of(model)
+        driver.prepare(run())
+        driver.start()
+        device = driver.device()
+        running, ticks = device.status(), device.read(r.TIME)
+        monkeypatch.setattr(device, "status", lambda: running)
+        monkeypatch.setattr(device, "read", lambda register: ticks)
+        with pytest.raises(TriggerError, match=r"did not end within 0\.\d+ s: running with"):
+            driver.stop()
+        monkeypatch.undo()
+        driver.close()
 
 
 def test_the_wire_carries_the_settings_of_the_registers() -> None:

@@ -8,6 +8,7 @@ from ctypes import byref, c_double, c_int64, c_uint, c_void_p
 from typing import TYPE_CHECKING, Any
 
 from acquire.camera.aravis.bindings import errors
+from acquire.camera.settings import await_done
 from acquire.errors import CameraError
 
 if TYPE_CHECKING:
@@ -126,6 +127,32 @@ class AravisNode:
                 put(self._device, self._key, given, error)
             elif value:
                 self._library.arv_device_execute_command(self._device, self._key, error)
+        if self.kind == "command" and value:
+            await_done(self.name, self._is_done)
+
+    def _is_done(self) -> bool:
+        """Return whether the command's register holds another value again; Aravis does not say it itself.
+
+        A register that cannot be read says nothing, and the command counts as done (GenApi).
+        """
+        library = self._library
+        register = wanted = None
+        child = library.arv_dom_node_get_first_child(self._node)
+        while child:
+            kind = library.arv_dom_node_get_node_name(child)
+            if kind == b"pValue":
+                register = library.arv_gc_property_node_get_linked_node(child)
+            elif kind in (b"CommandValue", b"pCommandValue"):
+                with errors(self.name) as error:
+                    wanted = library.arv_gc_property_node_get_int64(child, error)
+            child = library.arv_dom_node_get_next_sibling(child)
+        if not register or wanted is None:
+            return True
+        if library.arv_gc_feature_node_get_actual_access_mode(register) not in (0, 2):
+            return True
+        with errors(self.name) as error:
+            name = library.arv_gc_feature_node_get_name(register)
+            return bool(library.arv_device_get_integer_feature_value(self._device, name, error) != wanted)
 
     def limits(self) -> tuple[float, float, float]:
         """Return minimum, maximum, increment; computed nodes may have none: then those of the type."""

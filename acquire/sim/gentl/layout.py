@@ -30,7 +30,7 @@ WORDS = (
     "MAGIC", "VERSION",
     "PRESENT", "PLUGGED",
     "SESSION", "ACK",
-    "HEAD", "TAIL",
+    "HEAD", "TAIL", "BEGIN",
     "SENSOR_WIDTH", "SAMPLE_BYTES", "SENSOR_BITS",
     "LINE_CAPACITY", "LINE_STRIDE", "HEADERS_AT", "LINES_AT",
     "ROW_PADDING", "ID_BITS", "ID_FIRST",
@@ -41,6 +41,7 @@ WORDS = (
 PRESENT      1 while the camera is plugged in; PLUGGED counts how often it was plugged in
 SESSION, ACK odd while the host acquires; the feeder copies it to ACK once it has carried out the request
 HEAD, TAIL   total lines written by the feeder, and total lines taken by the producer
+BEGIN        HEAD when the host started to acquire: lines before it are of an earlier acquisition
 """
 
 FAULTS_AT = 64

@@ -59,7 +59,7 @@ struct buffer {
     size_t size, filled;
     void *user;
     int ours, queued, waiting, incomplete, too_large;
-    word frame_id, time_ns, height, width, format, padding;
+    word frame_id, time_ns, height, width, offset, format, padding;
     struct buffer *next;     /* next in the queue */
     struct buffer *next_all; /* next of the stream */
 };
@@ -75,6 +75,7 @@ struct stream {
     int running, end, killed, registered;
     struct buffer *all;
     struct queue input, output;
+    word session; /* when the stream was started: even, the camera idles */
     word announced, delivered, underruns, started, fired;
 };
 
@@ -320,7 +321,8 @@ static gc_error ask(struct device *d, int acquire)
 {
     word session = load(&d->words[W_SESSION]), until = now_ns() + ANSWER_NS;
     if ((session & 1) != (word)acquire) {
-        if (acquire) store(&d->words[W_TAIL], load(&d->words[W_HEAD]));
+        /* The stream's thread alone writes TAIL: it may still be taking lines of the session before. */
+        if (acquire) store(&d->words[W_BEGIN], load(&d->words[W_HEAD]));
         store(&d->words[W_SESSION], ++session);
     }
     while (load(&d->words[W_ACK]) != session) {
@@ -838,6 +840,7 @@ static void end_frame(struct stream *s, const struct shape *shape, struct fillin
         if (!f->bad) b->frame_id = id_of(s->device, f->frame); /* else the header is lost, and the old value stays */
         b->height = f->cut;
         b->width = shape->width;
+        b->offset = shape->offset;
         b->format = shape->format;
         b->padding = shape->pitch - shape->row;
         b->filled = shape->pitch * f->cut < b->size ? shape->pitch * f->cut : b->size;
@@ -887,7 +890,7 @@ static void *fill(void *argument)
     struct device *d = s->device;
     struct shape shape = shape_of(d);
     struct filling f = {0};
-    word session = load(&d->words[W_SESSION]);
+    word session = s->session; /* not the present one: the host may have started before this thread runs */
     while (!__atomic_load_n(&s->end, __ATOMIC_ACQUIRE)) {
         word tail, head;
         if (load(&d->words[W_SESSION]) != session) { /* a new session counts lines and frames from 0 */
@@ -895,6 +898,7 @@ static void *fill(void *argument)
             if (session & 1) {
                 if (f.buffer) { pthread_mutex_lock(&s->lock); push(&s->input, f.buffer); pthread_mutex_unlock(&s->lock); }
                 f = (struct filling){0};
+                store(&d->words[W_TAIL], load(&d->words[W_BEGIN]));
             }
         }
         if (gone(d)) {
@@ -906,6 +910,7 @@ static void *fill(void *argument)
         }
         tail = d->words[W_TAIL];
         head = load(&d->words[W_HEAD]);
+        if (load(&d->words[W_SESSION]) != session) continue; /* some of the lines may be of the next one */
         if (!(session & 1) || head == tail) { rest(TICK_NS); continue; }
         for (; tail < head && !gone(d); tail++) {
             take_line(s, &shape, &f, tail);
@@ -1023,6 +1028,7 @@ API gc_error DSStartAcquisition(struct stream *s, int32_t flags, uint64_t count)
     if (error) return error;
     s->end = s->killed = 0;
     s->delivered = 0;
+    s->session = load(&s->device->words[W_SESSION]);
     if (pthread_create(&s->thread, NULL, fill, s)) return fail(E_ERROR, "no thread");
     s->running = 1;
     return OK;
@@ -1111,7 +1117,8 @@ API gc_error DSGetBufferInfo(struct stream *s, void *handle, int32_t what, int32
     case 9: case 27: GIVE(T_SIZET, size_t, b->filled);
     case 10: GIVE(T_SIZET, size_t, b->width);
     case 11: GIVE(T_SIZET, size_t, reg(s->port.space, REG_BufferHeight));
-    case 12: case 13: case 15: case 18: GIVE(T_SIZET, size_t, 0);
+    case 12: GIVE(T_SIZET, size_t, b->offset);
+    case 13: case 15: case 18: GIVE(T_SIZET, size_t, 0);
     case 14: GIVE(T_SIZET, size_t, b->padding);
     case 16: GIVE(T_UINT64, uint64_t, b->frame_id);
     case 17: GIVE(T_BOOL8, uint8_t, 1);

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 _IDLE_S = 0.01
 _BLOCK_WAIT_S = 0.002
 _BASE = protocol.BOOTSTRAP_BYTES
-
+_IMAGE_REGISTERS = slice(_BASE + REGISTERS["Width"], _BASE + REGISTERS["PayloadSize"])
 
 _KEPT_FRAMES = 16
 """Number of recent frames whose packets can be sent again."""
@@ -89,7 +89,9 @@ class GigeCamera:
         self.transmission = transmission
         if not transmission.resends:
             self._registers.set(protocol.CAPABILITY, 0)
-        self._sensor, self._bits = sensor, model.bits
+        self._sensor, self._bits, self._sensor_width = sensor, model.bits, model.sensor_width
+        offered = gige(model).features["PixelFormat"].entries
+        self._formats = {PIXEL_FORMATS[name][0]: PIXEL_FORMATS[name][1:] for name in offered}
         self._control = [_bound(address, shared=False), _bound("255.255.255.255", shared=True)]
         self._lines = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._lines.bind((address, 0))
@@ -130,18 +132,32 @@ class GigeCamera:
             return
         # The same request again means that its answer did not arrive in time: only the answer is repeated.
         if (sender, request) != self._answered[:2]:
-            self._answered = (sender, request, self._registers.handle(request))
-            # Before the answer is sent: the host may start the trigger as soon as it has the answer.
-            self._apply_registers()
+            before = self._registers.memory[_IMAGE_REGISTERS]
+            result = self._registers.handle(request)
+            if self._has_valid_image():
+                # Before the answer is sent: the host may start the trigger as soon as it has the answer.
+                self._apply_registers()
+            else:
+                self._registers.memory[_IMAGE_REGISTERS] = before
+                result = protocol.answer(request, b"", protocol.Status.INVALID_PARAMETER)
+            self._answered = (sender, request, result)
         reply = self._answered[2]
         if reply is not None:
             self._control[0].sendto(reply, sender)
 
+    def _has_valid_image(self) -> bool:
+        """Return whether lines can be sent as the registers say: a host need not keep to the description."""
+        width = self._register("Width")
+        return (
+            self._register("PixelFormat") in self._formats
+            and width > 0
+            and self._register("OffsetX") + width <= self._sensor_width
+            and self._register("Height") > 0
+        )
+
     def _apply_registers(self) -> None:
         """Carry out the commands that the host has set in registers; they read back as 0 once done."""
-        stored = next(
-            stored for at, _, stored in PIXEL_FORMATS.values() if at == self._register("PixelFormat")
-        )
+        _, stored = self._formats[self._register("PixelFormat")]
         pixels = self._register("Width") * self._register("Height")
         self._set_register("PayloadSize", pixels * stored // 8)
         for name, wanted in (("AcquisitionStop", False), ("AcquisitionStart", True)):
@@ -160,7 +176,7 @@ class GigeCamera:
         code = self._register("PixelFormat")
         offset, width = self._register("OffsetX"), self._register("Width")
         # Samples as the pixel format stores them; `gige` offers only formats that are not packed.
-        significant, stored = next((used, bits) for at, used, bits in PIXEL_FORMATS.values() if at == code)
+        significant, stored = self._formats[code]
         samples = lines[:, offset : offset + width]
         excess = self._bits - significant
         # the sensor's most significant bits, as a camera with fewer bits sends them
@@ -176,6 +192,7 @@ class GigeCamera:
             height=len(lines),
             data=data,
             extended=transmission.extended,
+            offset=offset,
         )
         packets = list(protocol.packets(frame, self._registers.get(protocol.PACKET_SIZE) & 0xFFFF))
         self._sent.append((number, packets))

@@ -43,6 +43,14 @@ _TRAILER = struct.Struct(">HHI")
 _IMAGE = 1
 
 
+class Status(IntEnum):
+    """Why a command was not carried out, in its answer."""
+
+    DONE = 0
+    INVALID_PARAMETER = 0x8002
+    INVALID_ADDRESS = 0x8003
+
+
 class Command(IntEnum):
     DISCOVERY = 0x0002
     RESEND = 0x0040
@@ -81,9 +89,9 @@ def parse_resend(request: Request) -> tuple[int, int, int]:
     return number, first & 0xFF_FFFF, last & 0xFF_FFFF
 
 
-def answer(request: Request, body: bytes) -> bytes:
+def answer(request: Request, body: bytes, status: Status = Status.DONE) -> bytes:
     # an acknowledge has the number after its command's
-    return _ANSWER.pack(0, request.command + 1, len(body), request.number) + body
+    return _ANSWER.pack(status, request.command + 1, len(body), request.number) + body
 
 
 class Registers:
@@ -110,25 +118,39 @@ class Registers:
 
     def handle(self, request: Request) -> bytes | None:
         """Carry out a command and return its answer; None if it is not supported."""
+        try:
+            return self._carry_out(request)
+        except IndexError:
+            return answer(request, b"", Status.INVALID_ADDRESS)
+        except struct.error:  # a body that is too short for its command
+            return answer(request, b"", Status.INVALID_PARAMETER)
+
+    def _carry_out(self, request: Request) -> bytes | None:
         match request.command:
             case Command.DISCOVERY:
                 return answer(request, bytes(self.memory[:DISCOVERY_BYTES]))
             case Command.READ_REGISTER:
                 (at,) = struct.unpack(">I", request.body[:4])
-                return answer(request, bytes(self.memory[at : at + 4]))
+                return answer(request, bytes(self.memory[self._place(at, 4)]))
             case Command.WRITE_REGISTER:
                 at, value = struct.unpack(">II", request.body[:8])
-                self.set(at, value)
+                self.memory[self._place(at, 4)] = struct.pack(">I", value)
                 return answer(request, struct.pack(">I", 1))
             case Command.READ_MEMORY:
                 at, count = struct.unpack(">IxxH", request.body[:8])
-                return answer(request, request.body[:4] + bytes(self.memory[at : at + count]))
+                return answer(request, request.body[:4] + bytes(self.memory[self._place(at, count)]))
             case Command.WRITE_MEMORY:
                 (at,) = struct.unpack(">I", request.body[:4])
                 data = request.body[4:]
-                self.memory[at : at + len(data)] = data
+                self.memory[self._place(at, len(data))] = data
                 return answer(request, struct.pack(">I", len(data)))
         return None
+
+    def _place(self, at: int, count: int) -> slice:
+        """Return the place of ``count`` bytes. Raises IndexError if the camera has none there."""
+        if at + count > len(self.memory):
+            raise IndexError(at)
+        return slice(at, at + count)
 
 
 @dataclass(frozen=True, slots=True)
@@ -142,13 +164,14 @@ class Frame:
     height: int
     data: bytes
     extended: bool = False
+    offset: int = 0
 
 
 def packets(frame: Frame, packet_size: int) -> Iterator[bytes]:
     """Yield leader, payload and trailer."""
     size = (_GVSP_EXTENDED if frame.extended else _GVSP).size
     step = packet_size - IP_AND_UDP_BYTES - size
-    leader = (0, _IMAGE, frame.time_ns, frame.pixel_format, frame.width, frame.height, 0, 0, 0, 0)
+    leader = (0, _IMAGE, frame.time_ns, frame.pixel_format, frame.width, frame.height, frame.offset, 0, 0, 0)
     # formats of packets: 1 is a leader, 3 payload, 2 a trailer
     yield _header(frame, 1, 0) + _LEADER.pack(*leader)
     count = 0

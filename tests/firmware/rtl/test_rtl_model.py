@@ -156,6 +156,7 @@ def compare_pins(pair: Pair, config: dict[r.Register, int]) -> None:
     a = r.TRIGGER_A.unpack(config[r.TRIGGER_A])
     if a["enable"] and not a["invert"] and r.LINE.mode.of(config[r.LINE]) == LineMode.PER_LINE:
         assert seen.pulses_a == pair.wire.read().issued == lines
+        assert seen.delay_a == config[r.TRIGGER_A_DELAY]
     led = r.LED.unpack(config[r.LED])
     shown = 2 * (config[r.WINDOW_CLOSE] - config[r.WINDOW_OPEN]) > config[r.SUBSTEP_CLOCKS]
     memory = r.CODE_SOURCE.kind.of(config[r.CODE_SOURCE]) == Source.MEMORY

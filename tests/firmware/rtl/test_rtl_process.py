@@ -19,7 +19,7 @@ from acquire.cli.demo.plan import DemoPlan, trigger_settings
 from acquire.cli.journal import Journal
 from acquire.codes import PrbsCode
 from acquire.config import load_rig
-from acquire.config.device import TriggerConfig
+from acquire.config.device import LineOutputConfig, TriggerConfig
 from acquire.errors import DeviceError, TriggerError, UsageError
 from acquire.rig import Rig
 from acquire.sim.lines import StreamingArm
@@ -52,7 +52,13 @@ def driver(page: PinPage, opened: list[RtlTransport]) -> Iterator[TriggerDriver]
         opened.append(RtlTransport(CLOCK_HZ, page))
         return opened[-1]
 
-    config = TriggerConfig(driver="rtl", clock_hz=CLOCK_HZ, substep_ticks=TICKS)
+    config = TriggerConfig(
+        driver="rtl",
+        clock_hz=CLOCK_HZ,
+        substep_ticks=TICKS,
+        a=LineOutputConfig(delay_ticks=0),
+        b=LineOutputConfig(delay_ticks=30),
+    )
     made = TriggerDriver(connect, config)
     yield made
     made.close()
@@ -76,6 +82,8 @@ def test_cameras_see_the_pulses_and_the_light_that_the_pins_gave(
         ended = [wire.wait(number, 1 << 40, timeout_s=5) for wire in wires]
         assert all(reading.stopped and reading.issued == lines for reading in ended)
         assert reading.train.line_period_ns == 30_000
+        trains = [wire.read().train for wire in wires]
+        assert [train and train.settled_s for train in trains] == [{"a": 0.0}, {"b": 5e-6}]
         after = wires[1].code(reading.train).bits(3 * lines - 6, 20)
         np.testing.assert_array_equal(after[:6], CODE.bits(3 * lines - 6, 6))
         assert not after[6:].any()

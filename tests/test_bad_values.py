@@ -1,0 +1,105 @@
+"""Values that the library cannot use end in an error that says what is possible, not in one of numpy's."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from math import nan
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from acquire.client import Client
+from acquire.codes import ConstantCode, ListedCode, PrbsCode, code_from_attrs, state_at
+from acquire.config import load_rig, load_scene
+from acquire.errors import UsageError
+from acquire.recon import reconstruct
+from acquire.recon.segments import Voxels
+from acquire.reconstruct import by_lines, by_time, in_glimpses, in_voxels
+from acquire.simulate import bench_of, simulate, study
+from acquire.store import Recording, open_recording
+
+PRBS = PrbsCode.from_seed(16, 1)
+LISTED = ListedCode.of(np.array([1, 0, 1], np.uint8))
+
+OF_CODES: dict[str, tuple[Callable[[], Any], str]] = {
+    "degree": (lambda: PrbsCode.from_seed(-1, 1), "no prbs code of degree -1; possible: 3, 4"),
+    "seed": (lambda: PrbsCode.from_seed(16, 1.5), r"the seed 1\.5; possible: an integer"),  # type: ignore[arg-type]
+    "state": (lambda: PrbsCode(16, 1.5), r"the state 1\.5; possible: 1 to 0xffff"),  # type: ignore[arg-type]
+    "text": (lambda: PrbsCode(16, "1"), "the state '1'; possible"),  # type: ignore[arg-type]
+    "prbs": (lambda: PRBS.bits(0, -1), "start = 0 and length = -1; possible: integers, length 0 or more"),
+    "constant": (lambda: ConstantCode(1).bits(0, -1), "length = -1; possible"),
+    "listed": (lambda: LISTED.bits(0, -1), "length = -1; possible"),
+    "start": (lambda: PRBS.bits(0.5, 3), r"start = 0\.5 and length = 3; possible"),  # type: ignore[arg-type]
+    "index": (lambda: state_at(16, 1, -1), "start = -1 .*start and length 0 or more"),
+    "two": (lambda: ListedCode.of(np.array([1, 2])), "no list of code bits; possible: .* 0 and 1"),
+    "float": (lambda: ListedCode.of(np.array([0.0, 1.0])), "dtype float64 is no list of code bits"),
+    "square": (lambda: ListedCode.of(np.eye(3, dtype=int)), r"shape \(3, 3\) and dtype int64 is no list"),
+    "no degree": (lambda: code_from_attrs({"kind": "prbs"}), "describes no code: KeyError: 'degree'; poss"),
+    "no value": (lambda: code_from_attrs({"kind": "constant"}), "describes no code: KeyError"),
+    "no bits": (lambda: code_from_attrs({"kind": "bits"}), "describes no code: KeyError"),
+    "none": (lambda: code_from_attrs(None), "code attribute None describes no code"),  # type: ignore[arg-type]
+}
+
+
+@pytest.mark.parametrize("name", OF_CODES)
+def test_of_codes(name: str) -> None:
+    make, words = OF_CODES[name]
+    with pytest.raises(UsageError, match=words):
+        make()
+
+
+def test_numpys_integers_are_integers() -> None:
+    assert PRBS.bits(np.int64(0), np.int64(4)).tolist() == PRBS.bits(0, 4).tolist()  # type: ignore[arg-type]
+
+
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory: pytest.TempPathFactory) -> Recording:
+    path = tmp_path_factory.mktemp("bad") / "r.zarr"
+    simulate(load_rig("rig-demo", {"geometry.stages": 8}), load_scene("scene-leds"), path, 60)
+    return open_recording(path)
+
+
+OF_LINES: dict[str, tuple[Callable[[Any], Any], str]] = {
+    "cut": (lambda r: r.cut(0.5, 10), r"first_line cannot be 0\.5; possible: an integer; try: int"),
+    "cut lines": (lambda r: r.cut(0, 10.0), r"lines cannot be 10\.0; possible"),
+    "cut text": (lambda r: r.cut("0", 10), "first_line cannot be '0'; possible"),
+    "cut none": (lambda r: r.cut(0, None), "lines cannot be None; possible"),
+    "whole lines": (lambda r: r.whole_lines(0.5, 10), r"first_line cannot be 0\.5; possible"),
+    "by lines": (lambda r: by_lines(r, 0.5, 10), r"first_line cannot be 0\.5; possible"),  # type: ignore[arg-type]
+    "by lines text": (lambda r: by_lines(r, "0", 10), "first_line cannot be '0'; possible"),  # type: ignore[arg-type]
+    "by time": (lambda r: by_time(r, nan, None), "begin_ns cannot be nan; possible: nanosec"),  # type: ignore[arg-type]
+    "longest": (
+        lambda r: in_voxels(by_lines(r), Voxels(6, 10), longest=0),
+        "sub-segments of 0 sub-steps are not possible; possible: 1 or more",
+    ),
+    "glimpses": (
+        lambda r: in_glimpses(by_lines(r), Voxels(6, 10), 0),
+        "0 glimpses are not possible; possible: 1 or more",
+    ),
+    "glimpses of nothing": (lambda r: in_glimpses(by_lines(r), Voxels(6, 0), 3), "merge T_m = 0 is out of"),
+    "a recording": (lambda r: reconstruct(r, 6, 10), r"a Recording cannot be .*try: recording\.cut\("),
+}
+
+
+@pytest.mark.parametrize("name", OF_LINES)
+def test_of_lines(recording: Recording, name: str) -> None:
+    make, words = OF_LINES[name]
+    with pytest.raises(UsageError, match=words):
+        make(recording)
+
+
+def test_of_simulations(tmp_path: Path) -> None:
+    rig, scene = load_rig("rig-demo", {"geometry.stages": 8}), load_scene("scene-leds")
+    with pytest.raises(UsageError, match=r"lines cannot be 1\.5; possible: an integer"):
+        simulate(rig, scene, tmp_path / "r.zarr", 1.5)  # type: ignore[arg-type]
+    with pytest.raises(UsageError, match="a study of 0 lines is not possible; possible: 1 or more"):
+        study(bench_of(rig, scene), rig.code.build(), 0)
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("place", ["http://[::1", "ftp://host:80", "http://host:99999", "http://"])
+def test_of_addresses(place: str) -> None:
+    with pytest.raises(UsageError, match="is not a valid address; possible: http://HOST:PORT, or a socket"):
+        Client(place)
