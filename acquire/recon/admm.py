@@ -17,9 +17,12 @@ iteration is over-relaxed by 1.7 (Eckstein and Bertsekas, Math. Program. 55, 293
 
 from __future__ import annotations
 
+import math
 from copy import copy
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
+
+from array_api_compat import is_numpy_array
 
 from acquire.arrays import dot, namespace
 from acquire.errors import NumericsError
@@ -33,6 +36,10 @@ if TYPE_CHECKING:
     from acquire.recon.basis import Basis
     from acquire.recon.denoisers import Denoiser
     from acquire.recon.problem import MaskedOperator
+
+PART_PIXELS, PART_ROWS = 1 << 19, 4
+"""Pixels of the instants that are handled together, 2 MB; and the fewest instants, relative to the number of
+coefficient frames: the product of fewer spends more time on the frames than on the instants."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,9 +101,10 @@ class Admm:
         self._w = arrays.zeros(samples.shape)
         self.rebase(operator, basis, arrays.zeros(theta_shape) if start is None else start)
         self._tv_multiplier = arrays.zeros(theta_shape)
-        # where the start is, not 0: the first data step would otherwise draw a warm start to darkness
-        self._sign = self._xp.maximum(self._xp.tensordot(self._grid.T, self.theta, axes=1), self._least)
-        self._sign_multiplier = arrays.zeros(self._sign.shape)
+        # The split of the sign, max(·, 0), plus its multiplier over ρ, min(·, 0): one is 0 where the other is
+        # not, so that their sum tells both. Over all instants it is by far the largest array of a solver for
+        # few patterns. It begins at the start, not at 0, which would draw a warm start to darkness.
+        self._signed = self._xp.maximum(self._whole(self.theta, slice(None)), 0)
 
     def rebase(self, operator: MaskedOperator, basis: Basis, theta: Array) -> None:
         """Continue in another basis with the same number of rows and cosines, close to the last one.
@@ -109,9 +117,20 @@ class Admm:
         grid = min(basis.frames, self._parameters.grid_per_coefficient * basis.cosines)
         self._grid = basis.arrays.asarray(basis.matrix(grid))
         background = self._background
-        self._least = 0 if background is None else -self._xp.tensordot(self._grid.T, background, axes=1)
+        self._known = None if background is None else self._xp.tensordot(self._grid.T, background, axes=1)
         self._lifted = operator.adjoint(self._w)  # BᵀW·w
+        self._instants = self._in_parts(self._grid.shape[1])
         self._prepare()
+
+    def _in_parts(self, instants: int) -> list[slice]:
+        """Slices of the instants whose temporary arrays are small, where that costs no time.
+
+        A product of many rows is slower in parts, and so is everything on other devices.
+        """
+        rows, *frame = self.theta.shape
+        at_once = max(PART_PIXELS // math.prod(frame), PART_ROWS * rows)
+        step = at_once if is_numpy_array(self.theta) else instants
+        return [slice(first, first + step) for first in range(0, instants, step)]
 
     def reweigh(self, parameters: AdmmParameters) -> None:
         """Continue with other weights; what is stored divided by ρ, multipliers and w, keeps its value."""
@@ -119,7 +138,9 @@ class Admm:
         self._w *= old.penalty / parameters.penalty
         self._lifted *= old.penalty / parameters.penalty
         self._tv_multiplier *= old.tv_penalty / parameters.tv_penalty
-        self._sign_multiplier *= old.sign_penalty / parameters.sign_penalty
+        for some in self._instants:
+            signed = self._signed[some, ...]
+            self._signed[some, ...] = _rescaled(self._xp, signed, old.sign_penalty / parameters.sign_penalty)
         self._strength = self._emphasis * (parameters.tv_weight / parameters.tv_penalty)
         self._prepare()
 
@@ -132,20 +153,20 @@ class Admm:
         self._lifted = self._operator.adjoint(self._w)
         self._tv_multiplier = other._tv_multiplier * (old.tv_penalty / new.tv_penalty)
         # the splits are in units of θ; only multipliers are divided by ρ
-        self._sign = self._xp.asarray(other._sign, copy=True)
-        self._sign_multiplier = other._sign_multiplier * (old.sign_penalty / new.sign_penalty)
+        self._signed = _rescaled(self._xp, other._signed, old.sign_penalty / new.sign_penalty)
 
     def with_problem(self, operator: MaskedOperator, samples: Array, heavier: float = 1.0) -> Admm:
         """A solver that continues from here with other samples or another mask, and a ``heavier`` prior.
 
         This one stays as it is, except for the denoiser's dual field, which both share.
         """
-        # `step` changes w, BᵀW·w and the TV multiplier in place; what it replaces can be shared
+        # `step` changes w, BᵀW·w and the multipliers in place; what it replaces can be shared
         other = copy(self)
         other._parameters = replace(self._parameters, tv_weight=heavier * self._parameters.tv_weight)
         other._strength = self._strength * heavier
         other._samples, other._operator = samples, operator
         other._tv_multiplier = self._xp.asarray(self._tv_multiplier, copy=True)
+        other._signed = self._xp.asarray(self._signed, copy=True)
         other._w = self._xp.asarray(self._w, copy=True)
         other._lifted = operator.adjoint(other._w)
         other._prepare()
@@ -170,14 +191,13 @@ class Admm:
         relaxed = self._data_step()
         relaxed *= relaxation
         relaxed += (1 - relaxation) * self.theta
-        values = self._xp.tensordot(self._grid.T, relaxed, axes=1)
+        for some in self._instants:
+            values = self._whole(relaxed, some)
+            values += self._xp.minimum(self._signed[some, ...], 0)
+            self._signed[some, ...] = values
         self.theta = self._denoiser.prox(relaxed + self._tv_multiplier, self._strength)
         relaxed -= self.theta
         self._tv_multiplier += relaxed
-        values += self._sign_multiplier
-        self._sign = self._xp.maximum(values, self._least)
-        values -= self._sign
-        self._sign_multiplier = values
 
     def _data_step(self) -> Array:
         p = self._parameters
@@ -185,9 +205,14 @@ class Admm:
         # the grid's rows are orthonormal, so that both splits together are one ρ/2·‖θ − centre‖²
         centre = self.theta - self._tv_multiplier
         centre *= p.tv_penalty
-        signed = self._xp.tensordot(self._grid, self._sign - self._sign_multiplier, axes=1)
-        signed *= p.sign_penalty
-        centre += signed
+        for some in self._instants:
+            # the split minus its multiplier
+            reflected = self._xp.abs(self._signed[some, ...])
+            if self._known is not None:
+                reflected -= self._known[some, ...]
+            pull = self._xp.tensordot(self._grid[:, some], reflected, axes=1)
+            pull *= p.sign_penalty
+            centre += pull
         centre /= rho
         # y − W·B·c − (W·B·BᵀW + ρ)·w, with a single product, since `_lifted` is BᵀW·w
         residual = self._samples - self._operator.forward(centre + self._lifted) - rho * self._w
@@ -199,6 +224,11 @@ class Admm:
         self._descend(residual, rho)
         centre += self._lifted
         return centre
+
+    def _whole(self, theta: Array, some: slice) -> Array:
+        """The light of coefficients and background, which is not negative, at some of the grid's instants."""
+        values = self._xp.tensordot(self._grid[:, some].T, theta, axes=1)
+        return values if self._known is None else values + self._known[some, ...]
 
     def _descend(self, residual: Array, rho: float) -> None:
         """Make conjugate-gradient steps on (W·B·BᵀW + ρ)·w; ``residual`` is overwritten."""
@@ -225,3 +255,8 @@ class Admm:
             if energy <= enough:
                 return
             direction = scaled + (energy / before) * direction
+
+
+def _rescaled(xp: Any, signed: Array, factor: float) -> Array:
+    """The sum of a split and its multiplier, with the multiplier times ``factor``."""
+    return xp.maximum(signed, 0) + xp.minimum(signed, 0) * factor

@@ -20,6 +20,7 @@ from acquire.arrays import Arrays, dot, host, open_arrays
 from acquire.blur import Blur
 from acquire.codes import mix_seed, prbs
 from acquire.errors import UsageError
+from acquire.evaluate.metrics import psnr
 from acquire.forward import DualArm, GatheredArms, merge_video
 from acquire.geometry import Geometry
 from acquire.lines import Segment
@@ -150,15 +151,17 @@ def test_every_stage_of_the_default(device: str, segment: Segment) -> None:
         assert error(result) < 0.2
 
 
-@pytest.mark.parametrize("scene", ["flicker", "leds"])
-def test_every_trial_of_the_choice(device: str, scene: str) -> None:
-    """Still, volumes, free brightness and a glance at the cosines: the choice is the same everywhere."""
+@pytest.mark.parametrize(("scene", "least_db"), [("flicker", 24), ("leds", 26)])
+def test_every_trial_of_the_choice(device: str, scene: str, least_db: float) -> None:
+    """Still, volumes, free brightness and a glance at the cosines: the choice is the same everywhere.
+
+    Patterns and curves are not to the last digit, as above.
+    """
     given = record(scene, 3, stages=8, lines=60)
-    here, there = (
-        reconstruct(given.segment, 2, 1, "fast", dtype="float64", device=on) for on in ("cpu", device)
-    )
-    assert there.parameters["prior"] == here.parameters["prior"]
-    assert difference(there, here) < 0.02
+    results = [reconstruct(given.segment, 2, 1, "fast", dtype="float64", device=on) for on in ("cpu", device)]
+    assert results[0].parameters["prior"] == results[1].parameters["prior"]
+    for result in results:
+        assert psnr(result.video[result.trusted], given.truth(2, 1)) > least_db
 
 
 def test_patterns_and_curves(segment: Segment) -> None:
