@@ -109,10 +109,15 @@ class DualArm:
         for _ in range(steps):
             # every v gives a bound; power iteration turns v into the one for which it is tight
             w = self.adjoint(self.forward(v))
-            bound = min(bound, float((w[sampled] / v[sampled]).max()))
-            v = w / w.max()
+            # frame by frame and in place: a video of a large sensor is a gigabyte
+            ratios = (
+                float((a[lit] / b[lit]).max(initial=0)) for a, b, lit in zip(w, v, sampled, strict=True)
+            )
+            bound = min(bound, max(ratios))
+            w /= w.max()
+            v = w
             # v must stay positive for the bound to hold; it could underflow.
-            v[sampled] = np.maximum(v[sampled], np.finfo(self.dtype).tiny ** 0.5)
+            np.maximum(v, np.finfo(self.dtype).tiny ** 0.5, out=v, where=sampled)
         return float(np.sqrt(bound * (1 + 8 * np.finfo(self.dtype).eps)))  # rounding must not undercut it
 
     def _checked(self, array: NDArray[Any], shape: tuple[int, ...], what: str) -> NDArray[Any]:
