@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from acquire.cli.durations import seconds
-from acquire.cli.output import JsonFlag, print_json, print_table, say
+from acquire.cli.output import JsonFlag, print_json, print_table, print_warning, say
 from acquire.cli.places import new_directory
 from acquire.cli.progress import activity_progress, stage_progress
 from acquire.cli.tiles import TileOption, tile_of
@@ -138,7 +138,12 @@ def tradeoff(
             "host": host.busyness().facts(),
         }
         page = write_page(runs, truths, effects, directory=out, heading=heading, when=datetime.now(UTC))
-    kept = remember(_lessons(runs)) if learn else None
+    kept = None
+    if learn:
+        try:
+            kept = remember(_lessons(runs))
+        except OSError as error:  # the page is there, and may have taken hours
+            print_warning(f"the presets' results are not kept for --budget: {error}")
     if json:
         print_json({"page": str(page), "learned": kept and str(kept), "rows": table(runs)})
         return

@@ -55,8 +55,8 @@ def unit_text(rig: RigConfig, config: Path, *, user: bool, account: str | None =
     """Return the unit for a rig file. ``account``: user of the host's service; None: the current one."""
     recordings = rig.recording.directory.absolute()
     stop_s = round(rig.recording.seal_timeout_s) + STOP_S
-    python = _quoted(Path(sys.executable))
-    command = f"{python} -m acquire serve --config {_quoted(config.absolute())}"
+    python = _word(Path(sys.executable))
+    command = f"{python} -m acquire serve --config {_word(config.absolute())}"
     who = account or pwd.getpwuid(os.geteuid()).pw_name
     service = [
         "Type=notify",
@@ -130,7 +130,7 @@ def _hardening(recordings: Path, rig: RigConfig) -> list[str]:
 def _socket(rig: RigConfig) -> str:
     """Return the option for a socket that is not the default one of the service's environment."""
     socket = rig.control.socket
-    return "" if socket == default_socket() else f" --socket {_quoted(socket.absolute())}"
+    return "" if socket == default_socket() else f" --socket {_word(socket.absolute())}"
 
 
 def _memory(rig: RigConfig) -> list[str]:
@@ -157,3 +157,8 @@ def _quoted(path: Path) -> str:
     """Quote a path for systemd, which separates words at spaces and expands %."""
     text = str(path).replace("\\", "\\\\").replace('"', '\\"').replace("%", "%%")
     return f'"{text}"' if " " in text or '"' in text else text
+
+
+def _word(path: Path) -> str:
+    """Quote a path as a word of a command, in which systemd expands $ as well."""
+    return _quoted(path).replace("$", "$$")

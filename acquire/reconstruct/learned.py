@@ -15,6 +15,8 @@ from pathlib import Path
 from statistics import fmean
 from typing import TYPE_CHECKING
 
+from pydantic import TypeAdapter
+
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
 
@@ -68,10 +70,11 @@ def remember(found: Iterable[Learned], path: Path | None = None) -> Path:
 
 
 def recall(path: Path | None = None) -> list[Learned]:
-    """Return the results in the file; none if it is absent or not ours."""
+    """Return the results in the file; none if it is absent, damaged or not ours."""
     try:
         document = json.loads((path or learned_path()).read_text(encoding="utf-8"))
-        return [Learned(**each) for each in document["learned"]] if document["version"] == VERSION else []
+        known = document["learned"] if document["version"] == VERSION else []
+        return TypeAdapter(list[Learned]).validate_python(known)
     except (OSError, ValueError, TypeError, KeyError):
         return []
 

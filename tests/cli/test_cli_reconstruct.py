@@ -285,6 +285,19 @@ def test_a_budget_uses_the_learned_presets(
     assert answer.json["segments"][0]["parameters"]["dtype"] == "float64"
 
 
+def test_a_cache_that_cannot_be_written_costs_no_page(
+    cli: Cli, recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "cache").write_text("a file")
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    words = ("--voxels", "2x1", "--solver", "admm", "--lines", 60, "--repeats", 1, "--budget", 2, "--json")
+    answer = cli("tradeoff", recording, "--out", tmp_path / "t", *words)
+    assert answer.code == 0, answer.err
+    assert "not kept for --budget" in answer.err
+    assert answer.json["learned"] is None
+    assert (tmp_path / "t" / "index.html").exists()
+
+
 def test_fig_9_from_scene_to_page(cli: Cli, tmp_path: Path) -> None:
     answer = cli("paper", "fig9", "--out", tmp_path / "p", "--budget", 2, "--json")
     assert answer.code == 0, answer.err

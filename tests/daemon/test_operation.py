@@ -136,13 +136,13 @@ def test_the_unit_says_when_it_is_ready_and_what_it_may_not(tmp_path: Path) -> N
     assert "User" not in unit_of(tmp_path, user=True)
 
 
-def test_the_unit_names_a_python_whose_path_has_a_space(
+def test_the_unit_names_a_python_whose_path_has_a_space_or_a_dollar(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(sys, "executable", "/home/my user/.venv/bin/python")
+    monkeypatch.setattr(sys, "executable", "/home/my user/$venv/bin/python")
     unit = unit_of(tmp_path, user=True)
     for key in ("ExecStart", "ExecReload"):
-        assert unit[key].startswith('"/home/my user/.venv/bin/python" -m acquire ')
+        assert unit[key].startswith('"/home/my user/$$venv/bin/python" -m acquire ')
 
 
 @pytest.mark.skipif(

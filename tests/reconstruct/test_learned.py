@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import json
+
+import pytest
+
 from acquire.reconstruct.learned import Learned, choose, recall, remember
 
 SCENES = ("leds", "splash", "bullet")
@@ -53,4 +57,13 @@ def test_results_are_kept_and_replaced(tmp_path):
     remember([better, *GOOD], path)
     assert set(recall(path)) == {better, *FAST[1:], *GOOD}
     path.write_text("{")
+    assert recall(path) == []
+
+
+@pytest.mark.parametrize("change", [{"seconds": "soon"}, {"voxels": None}, {"psnr_db": []}])
+def test_a_file_that_somebody_edited_teaches_nothing(tmp_path, change):
+    path = tmp_path / "t.json"
+    document = json.loads(remember(FAST, path).read_text())
+    document["learned"][0] |= change
+    path.write_text(json.dumps(document))
     assert recall(path) == []

@@ -12,6 +12,7 @@ import pytest
 from live_daemon import Daemon, acquire
 from s3_server import S3Server
 
+from acquire.cli import replay
 from acquire.clock import ClockFit
 from acquire.codes import PrbsCode
 from acquire.lines import ARMS, LineFlag, TaggedBlock
@@ -187,6 +188,29 @@ def test_differences_of_an_inconsistent_recording_are_listed_by_array(
     found = {one["array"]: (one["rows"], one["row"]) for one in answer.json["differences"]}
     assert found == {"b/code": (1, 400), "b/tick": (1, 500), "b/time": (1, 500)}
     assert "differs from" in json.loads(answer.err.splitlines()[-1])["error"]["message"]
+
+
+def test_an_attempt_that_is_repeated_leaves_no_segment_behind(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The devices are left out: a disk that is too slow in the first attempt only is none of this machine."""
+    stored, out, paces = hard_recording(tmp_path / "run.zarr"), tmp_path / "again.zarr", []
+
+    def record(_: object, path: Path, pace: float) -> str | None:
+        paces.append(pace)
+        hard_recording(path)
+        if len(paces) > 1:
+            return None
+        hard_recording(path.with_name("again-2.zarr"))
+        document = json.loads((path / "zarr.json").read_text())
+        document["attributes"]["segments"] = ["again-2.zarr"]
+        (path / "zarr.json").write_text(json.dumps(document))
+        return "the rings were full"
+
+    monkeypatch.setattr(replay, "_record", record)
+    pace, _ = replay._replay_without_loss(open_recording(stored), out, 8.0)
+    assert paces == [8.0, pace]
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["again.zarr", "run.zarr"]
 
 
 def test_impossible_replays_are_refused_before_anything_is_created(tmp_path: Path) -> None:
