@@ -8,6 +8,8 @@ from __future__ import annotations
 
 import http.client
 import logging
+import os
+import signal
 import subprocess
 import threading
 import urllib.request
@@ -80,19 +82,24 @@ class Hooks:
     def _call(self, text: bytes) -> None:
         words, limit_s = list(self._config.command), self._config.timeout_s
         try:
-            done = subprocess.run(  # noqa: S603 - the command is in the rig's configuration
+            process = subprocess.Popen(  # noqa: S603 - the command is in the rig's configuration
                 words,
-                input=text,
+                stdin=subprocess.PIPE,
                 stdout=subprocess.DEVNULL,
-                timeout=limit_s,
-                check=False,
-                start_new_session=True,  # Ctrl-C on the daemon's terminal is not meant for it
+                # Ctrl-C on the daemon's terminal is not meant for it; and it is given up with its children
+                start_new_session=True,
             )
+            with process:
+                try:
+                    process.communicate(text, limit_s)
+                except subprocess.TimeoutExpired:
+                    os.killpg(process.pid, signal.SIGKILL)
+                    raise
         except (OSError, subprocess.TimeoutExpired) as error:
             log.warning("hook %s: %s", words[0], error)
             return
-        if done.returncode:
-            log.warning("hook %s ended with exit code %d", words[0], done.returncode)
+        if process.returncode:
+            log.warning("hook %s ended with exit code %d", words[0], process.returncode)
 
     def _post(self, url: str, text: bytes) -> None:
         request = urllib.request.Request(url, text, {"Content-Type": "application/json"})  # noqa: S310 - http, checked

@@ -14,6 +14,7 @@ import time
 from pathlib import Path
 from shutil import which
 
+import psutil
 import pytest
 from fake_run import FakeRun, rig_config
 
@@ -68,6 +69,22 @@ def test_a_hook_that_hangs_or_fails_is_given_up(tmp_path: Path, caplog: pytest.L
         time.sleep(0.02)
     for one in hooks:
         one.close()
+
+
+def test_a_hook_is_given_up_with_its_children(tmp_path: Path) -> None:
+    log, noted = NewsLog(), tmp_path / "child"
+    words = ("sh", "-c", f"sleep 3000 & echo $! > {noted}.new; mv {noted}.new {noted}; wait")
+    hooks = Hooks(HooksConfig(command=words, timeout_s=1), log, "rig")
+    log.add("loss", "arm a lost 5 lines: camera", level="error", lines=5)
+    deadline = time.monotonic() + 300
+    while not noted.exists():
+        assert time.monotonic() < deadline
+        time.sleep(0.02)
+    child = int(noted.read_text())
+    while psutil.pid_exists(child) and psutil.Process(child).status() != psutil.STATUS_ZOMBIE:
+        assert time.monotonic() < deadline
+        time.sleep(0.02)
+    hooks.close()
 
 
 def test_a_webhook_gets_json() -> None:
