@@ -12,7 +12,6 @@ import sys
 import threading
 import time
 from pathlib import Path
-from shutil import which
 
 import psutil
 import pytest
@@ -162,10 +161,7 @@ def test_the_unit_names_a_python_whose_path_has_a_space_or_a_dollar(
         assert unit[key].startswith('"/home/my user/$$venv/bin/python" -m acquire ')
 
 
-@pytest.mark.skipif(
-    which("systemd-analyze") is None,
-    reason="there is no systemd-analyze here, whose verdict on the unit is asked for",
-)
+@pytest.mark.needs_systemd
 def test_systemd_takes_the_unit(tmp_path: Path) -> None:
     install_service("rig-demo", directory=tmp_path)
     command = ["systemd-analyze", "verify", str(tmp_path / "acquire.service")]

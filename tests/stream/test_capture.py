@@ -35,11 +35,11 @@ from wired_devices import (
     pixels_of,
 )
 
-from acquire.errors import AcquireError, CameraError, DeviceError, StateError, TriggerError, UsageError
+from acquire.errors import StateError, TriggerError, UsageError
 from acquire.lines import ARMS, LineFlag
 from acquire.store import Recording, RunCondition, open_recording
 from acquire.stream import Begin, Capture, CaptureStatus
-from acquire.trigger.base import WATCHDOG, TagEvent, TriggerRun
+from acquire.trigger.base import WATCHDOG, TagEvent
 
 UNCONFIRMED = LineFlag.TIME_ESTIMATED | LineFlag.CODE_UNVERIFIED
 
@@ -468,47 +468,3 @@ def test_a_supervisor_that_its_trigger_holds_up_is_told(monkeypatch: pytest.Monk
         returns.set()
         until(lambda: not capture.poll().waiting, "an answer")
         assert capture.poll().fault is None
-
-
-@pytest.mark.parametrize(
-    ("fault", "kind", "text"),
-    [
-        ("refuse", CameraError, "camera b is in use; possible: another; try: unplug it"),
-        ("bug", AcquireError, "grabber b: ZeroDivisionError: a bug"),
-        ("die", DeviceError, "grabber b: killed by SIGKILL"),
-        ("hang", DeviceError, "grabber b: it did not answer in time"),
-        ("trigger", TriggerError, "the run is too fast"),
-    ],
-)
-def test_arm_undoes_everything_when_something_fails(
-    monkeypatch: pytest.MonkeyPatch, fault: str, kind: type[AcquireError], text: str
-) -> None:
-    if fault == "hang":  # until it is killed
-        monkeypatch.setattr("acquire.stream.capture._UNDO_S", 2.0)
-        monkeypatch.setattr("acquire.stream.capture._LEAST_END_S", 2.0)
-    bench = make_bench(fault_b=fault)
-    bench.trigger.refuse = fault == "trigger"
-    capture = Capture(bench.plan, bench.trigger)
-    with pytest.raises(kind) as failure:
-        capture.arm(timeout_s=6.0 if fault == "hang" else 60.0)
-    assert str(failure.value) == text
-    assert bench.trigger.stops == (fault == "trigger")
-    assert capture.poll() == CaptureStatus()
-    bench.wire.close()
-
-
-@pytest.mark.parametrize(
-    ("change", "text"),
-    [
-        ({"openers": {"a": None}}, "cameras a"),
-        ({"dtype": "float32"}, "float32"),
-        ({"ring_slots": 0}, "0 slots"),
-        ({"ring_slots": 1, "block_lines": 100}, "cannot have a tag every 100 lines"),
-        ({"run": TriggerRun("r", CODE, 9, 900, 100)}, "S = 9"),
-    ],
-)
-def test_plans_that_cannot_work_are_refused(change: dict[str, object], text: str) -> None:
-    bench = make_bench()
-    with pytest.raises(UsageError, match=text):
-        replace(bench.plan, **change)
-    bench.wire.close()
