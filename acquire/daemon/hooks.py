@@ -6,13 +6,12 @@ is given up after a timeout, and later news are sent afterwards, as far as the l
 
 from __future__ import annotations
 
-import http.client
 import logging
 import os
 import signal
 import subprocess
+import sys
 import threading
-import urllib.request
 from typing import TYPE_CHECKING
 
 from acquire.daemon.states import State
@@ -25,6 +24,8 @@ if TYPE_CHECKING:
 END_S = 2.0
 MOST_AT_ONCE = 20
 """Number of news that are sent one by one; of more only the latest."""
+START_S = 10.0
+"""Time in which `acquire.daemon.post` starts, which has a limit of its own from then on."""
 
 log = logging.getLogger("acquire.daemon")
 
@@ -68,10 +69,12 @@ class Hooks:
                 # Whoever gets the messages of several rigs must see whose it is.
                 named = news.model_copy(update={"text": f"{self._rig}: {news.text}"})
                 text = named.model_dump_json().encode()
+                limit_s = self._config.timeout_s
                 if self._config.command:
-                    self._call(text)
-                if self._config.webhook:
-                    self._post(self._config.webhook, text)
+                    _call(self._config.command[0], list(self._config.command), text, limit_s)
+                if url := self._config.webhook:
+                    words = [sys.executable, "-m", "acquire.daemon.post", f"{limit_s}"]
+                    _call(url, words, b"%s\n%s" % (url.encode(), text), limit_s, posts=True)
             if self._ended:
                 return
 
@@ -79,34 +82,38 @@ class Hooks:
         fault = news.kind == "state" and news.state is State.FAULTED and news.level == "error"
         return ("fault" if fault else news.kind) in self._config.on
 
-    def _call(self, text: bytes) -> None:
-        words, limit_s = list(self._config.command), self._config.timeout_s
-        try:
-            process = subprocess.Popen(  # noqa: S603 - the command is in the rig's configuration
-                words,
-                stdin=subprocess.PIPE,
-                stdout=subprocess.DEVNULL,
-                # Ctrl-C on the daemon's terminal is not meant for it; and it is given up with its children
-                start_new_session=True,
-            )
-            with process:
-                try:
-                    process.communicate(text, limit_s)
-                except subprocess.TimeoutExpired:
-                    os.killpg(process.pid, signal.SIGKILL)
-                    raise
-        except (OSError, subprocess.TimeoutExpired) as error:
-            log.warning("hook %s: %s", words[0], error)
-            return
-        if process.returncode:
-            log.warning("hook %s ended with exit code %d", words[0], process.returncode)
 
-    def _post(self, url: str, text: bytes) -> None:
-        request = urllib.request.Request(url, text, {"Content-Type": "application/json"})  # noqa: S310 - http, checked
-        try:
-            with urllib.request.urlopen(request, timeout=self._config.timeout_s):  # noqa: S310 - as above
-                return
-        except OSError as error:
-            log.warning("hook %s: %s", url, error)
-        except http.client.HTTPException as error:  # the port is another service's, or that of https
-            log.warning("hook %s: the answer is not HTTP: %r", url, error)
+def _call(name: str, words: list[str], text: bytes, limit_s: float, *, posts: bool = False) -> None:
+    """Give ``text`` to a command, or to `acquire.daemon.post`; log why that failed."""
+    try:
+        process = subprocess.Popen(  # noqa: S603 - the command is in the rig's configuration
+            words,
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE if posts else subprocess.DEVNULL,
+            # Ctrl-C on the daemon's terminal is not meant for it; and it is given up with its children
+            start_new_session=True,
+        )
+    except OSError as error:
+        log.warning("hook %s: %s", name, error)
+        return
+    try:
+        why, _ = process.communicate(text, limit_s + START_S * posts)
+    except subprocess.TimeoutExpired:
+        log.warning("hook %s timed out after %g s", name, limit_s)
+        _give_up(name, process)
+        return
+    if posts and process.returncode == -signal.SIGALRM:
+        log.warning("hook %s timed out after %g s", name, limit_s)
+    elif process.returncode and why:
+        log.warning("hook %s: %s", name, why.decode(errors="replace"))
+    elif process.returncode:
+        log.warning("hook %s ended with exit code %d", name, process.returncode)
+
+
+def _give_up(name: str, process: subprocess.Popen[bytes]) -> None:
+    """Kill a command with its children; one that cannot be killed, such as another user's, is left alone."""
+    try:
+        os.killpg(process.pid, signal.SIGKILL)
+        process.communicate(timeout=END_S)
+    except (OSError, subprocess.TimeoutExpired) as error:
+        log.warning("hook %s cannot be ended: %s", name, error)

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import configparser
+import contextlib
 import http.server
+import itertools
 import json
 import re
 import socket
@@ -122,6 +124,27 @@ def test_a_server_that_does_not_speak_http_ends_no_notifications(caplog: pytest.
                 connection.sendall(b"SSH-2.0-x\r\n")
         hooks.close()
     assert caplog.text.count("BadStatusLine") == 2
+
+
+def test_a_server_that_answers_byte_by_byte_is_given_up(caplog: pytest.LogCaptureFixture) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        server.settimeout(300)
+        log = NewsLog()
+        url = f"http://127.0.0.1:{server.getsockname()[1]}/x"
+        hooks = Hooks(HooksConfig(webhook=url, timeout_s=1), log, "rig")
+        log.add("loss", "x", level="error")
+        deadline = time.monotonic() + 300
+        connection, _ = server.accept()
+        # each byte comes in time
+        with connection, contextlib.suppress(OSError):
+            for byte in itertools.chain(b"HTTP/1.1 200 OK\r\nX: ", itertools.repeat(ord("x"), 60_000)):
+                connection.sendall(bytes([byte]))
+                time.sleep(0.05)
+                assert time.monotonic() < deadline
+        while "timed out after 1 s" not in caplog.text:
+            assert time.monotonic() < deadline
+            time.sleep(0.02)
+        hooks.close()
 
 
 @pytest.mark.parametrize("url", ["ftp://x", "http://", "http://user:secret@host/"])
