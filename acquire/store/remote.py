@@ -16,8 +16,9 @@ from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from acquire.errors import PlaceError, UsageError
+from acquire.errors import PlaceError, StoreError, UsageError
 from acquire.store.place import put_bytes, put_copy
+from acquire.text import shortened
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -105,8 +106,9 @@ class RemoteSource:
     def __init__(self, url: str) -> None:
         """Open the URL.
 
-        Raises UsageError for an invalid URL or one whose packages are not installed, and PlaceError for an
-        object store without credentials in the environment.
+        Raises UsageError for an invalid URL or one whose packages are not installed, PlaceError for an object
+        store without credentials in the environment, and StoreError if a server that is asked at once, as
+        ftp's and sftp's are, cannot be reached.
         """
         self.url = url.rstrip("/")
         check_url(self.url)
@@ -259,6 +261,10 @@ def _url_errors(url: str) -> Iterator[None]:
             possible=f"{', '.join(OBJECT_STORES)}, file, memory and what else fsspec has a package for",
             hint="pip install 'tdi-acquire[remote]'",
         ) from error
+    except Exception as error:  # every file system has errors of its own
+        raise StoreError(
+            f"{url} cannot be opened: {_words(error)}", hint="the network, and the address"
+        ) from error
 
 
 def _options(url: str) -> dict[str, Any]:
@@ -282,9 +288,11 @@ def _has_obstore() -> bool:
 
 @contextmanager
 def _as_os_errors() -> Iterator[None]:
-    """Turn obstore's exceptions into OSError."""
+    """Turn the exceptions of obstore, and of all other file systems, into OSError."""
     try:
         yield
+    except OSError:
+        raise
     except tuple(_store_errors()) as error:
         text = _ATTEMPTS.sub("", str(error).partition("\n")[0].partition(": <?xml")[0])
         kind = next(kind for known, kind in _store_errors().items() if isinstance(error, known))
@@ -293,6 +301,17 @@ def _as_os_errors() -> Iterator[None]:
         if status is not None:
             kind = _STATUS_ERRORS.get(status[1], kind)
         raise kind(text[:300]) from error
+    # Those of ftplib, aiohttp and others have no base class in common.
+    except Exception as error:
+        status_code = getattr(error, "status", None)  # of HTTP
+        raise _STATUS_ERRORS.get(str(status_code), OSError)(_words(error)) from error
+
+
+def _words(error: Exception) -> str:
+    """Return an error of a library in one line: some of them say nothing."""
+    if isinstance(error, OSError) and error.strerror:
+        return error.strerror
+    return shortened(str(error).partition("\n")[0], 300) or type(error).__name__
 
 
 @cache

@@ -9,13 +9,15 @@ import sys
 import threading
 import time
 import uuid
+import zipfile
 
+import fsspec
 import numpy as np
 import pytest
 import zarr
 from store_helpers import Truth, check_rows, fill, make_spec
 
-from acquire.errors import DataError, PlaceError, StateError, UsageError
+from acquire.errors import DataError, PlaceError, StateError, StoreError, UsageError
 from acquire.store import (
     Continuation,
     RecordingWriter,
@@ -365,3 +367,27 @@ def test_what_cannot_be_reached_is_told(bucket, path):
         RemoteSource("s3://nobucketofthisname").prove()
     RemoteSource(bucket).prove()
     assert b"acquire" in RemoteSource(bucket).read(PROOF)
+
+
+def test_errors_of_other_file_systems_are_told_with_the_address(tmp_path, monkeypatch):
+    """zipfile's, ftplib's and aiohttp's are no OSErrors."""
+    file = tmp_path / "far.zip"
+    place = f"zip://run.zarr::file://{file}"
+    with zipfile.ZipFile(file, "w") as archive:
+        archive.writestr("run.zarr/zarr.json", b"{}" * 100)
+    file.write_bytes(file.read_bytes().replace(b"{}{}", b"{}[]", 1))
+    with pytest.raises(StoreError, match=rf"^{place} cannot be read: Bad CRC-32"):
+        open_recording(place)
+    file.write_bytes(b"no archive")
+    with pytest.raises(StoreError, match=rf"^{place} cannot be opened: File is not a zip file"):
+        open_recording(place)
+
+    class ClientResponseError(Exception):  # as aiohttp's
+        status = 403
+
+    def refuse(*_, **__):
+        raise ClientResponseError("Forbidden")
+
+    monkeypatch.setattr(fsspec.get_filesystem_class("memory"), "cat_file", refuse)
+    with pytest.raises(PlaceError, match=r"^memory://x.zarr cannot be read: Forbidden; try: the credentials"):
+        open_recording("memory://x.zarr")
