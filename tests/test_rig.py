@@ -190,6 +190,28 @@ def test_a_trigger_can_be_opened_on_its_own(config):
     trigger.close()
 
 
+def test_a_scene_that_is_saved_while_cameras_are_opened_is_that_of_the_next_run(config, tmp_path):
+    """Both arms see one scene, that of the recording's description."""
+    file = tmp_path / "scene.toml"
+    file.write_text((builtin_directory() / "scene-leds.toml").read_text())
+    simulation = config.simulation.model_copy(update={"scene": str(file)})
+    with Rig(config.model_copy(update={"simulation": simulation})) as rig:
+
+        def run():
+            before = rig.simulated.sensor("a").optics.scene
+            changed = file.with_suffix(".new")
+            changed.write_text(file.read_text().replace("Scene #1", "Scene #2"))
+            changed.rename(file)
+            return before, rig.simulated.sensor("b").optics.scene
+
+        a, b = run()
+        assert a == b
+        assert rig.describe()["scene"]["title"] == a.title == "Scene #1: four LEDs"
+        a, b = run()
+        assert a == b
+        assert a.title == "Scene #2: four LEDs"
+
+
 def test_a_scene_that_cannot_be_shown_is_refused_before_anything_is_made(config, tmp_path):
     (tmp_path / "scene.toml").write_text('kind = "video"\npath = "none.mp4"\n')
     missing = config.simulation.model_copy(update={"scene": str(tmp_path / "scene.toml")})

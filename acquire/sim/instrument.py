@@ -48,6 +48,8 @@ class SimulatedDevices:
         self.config = config
         self._scene: SceneConfig | None = None
         self._scene_version: tuple[int, int] | None = None
+        self._shown = set(ARMS)
+        """Arms whose cameras have been given the scene as it was read last."""
         self._update_scene()
         self._wire = Wire()
         self._pins = PinPage() if config.trigger.driver == "rtl" else None
@@ -116,9 +118,13 @@ class SimulatedDevices:
     def sensor(self, arm: str) -> CameraOpener:
         """The model of the arm's camera, to be opened in any process."""
         config = self.config
+        # Once per pair of cameras: a file that is saved between the two must not show them different scenes.
+        if arm in self._shown:
+            self._update_scene()
+            self._shown.clear()
+        self._shown.add(arm)
         parts = {}
         for name in ARMS:
-            self._update_scene()
             assert self._scene is not None
             parts[name] = SimulatedCameraOpener(
                 wire=self.pulses(name),
