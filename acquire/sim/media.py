@@ -16,6 +16,7 @@ from fractions import Fraction
 from typing import TYPE_CHECKING, Any, Literal, Protocol, Self
 
 import numpy as np
+from numpy.lib import format as npy
 from pydantic import Field
 
 from acquire.config.base import FilePath
@@ -194,35 +195,68 @@ def _square(picture: Light, fit: str) -> Light:
 
 
 class _ArrayFile:
-    """``.npy``: (time, row, column) or (row, column); integers are scaled by their type's largest value."""
+    """``.npy``: (time, row, column) or (row, column); integers are scaled by their type's largest value.
+
+    Frames are read one by one and not mapped: a mapped file that is cut short would end the process.
+    """
 
     frame_rate_hz = None
 
     def __init__(self, path: Path) -> None:
+        self._path = path
         try:
-            video = np.load(path, mmap_mode="r", allow_pickle=False)
+            self._version = _version(path)
+            # mapped for its header only: no element is looked at
+            video = npy.open_memmap(path, mode="r")
         except (OSError, ValueError, EOFError) as error:
             raise UsageError(f"{path} is not an array: {error}") from error
-        self._video: NDArray[Any] = video[None] if video.ndim == 2 else video
-        if self._video.ndim != 3 or 0 in self._video.shape:
+        shape: tuple[int, ...] = (1, *video.shape) if video.ndim == 2 else video.shape
+        if len(shape) != 3 or 0 in shape:
             raise UsageError(
                 f"{path} is an array of shape {video.shape}", possible="(time, row, column) or (row, column)"
             )
-        if self._video.dtype.kind not in "buif":
-            raise UsageError(f"{path} is an array of {self._video.dtype}", possible="numbers")
+        if video.dtype.kind not in "buif":
+            raise UsageError(f"{path} is an array of {video.dtype}", possible="numbers")
+        self._shape, self._dtype, self._offset = shape, video.dtype, video.offset
+        # Frames of an array in Fortran order are scattered over the whole file.
+        self._whole: NDArray[Any] | None = (
+            None if video.flags.c_contiguous else np.load(path, allow_pickle=False).reshape(shape)
+        )
         self._white = float(np.iinfo(video.dtype).max) if video.dtype.kind in "ui" else 1.0
-        step = max(1, _CHECKED_VALUES // self._video[0].size)
-        for first in range(0, len(self._video), step):
-            part = self._video[first : first + step]
+        step = max(1, _CHECKED_VALUES // (shape[1] * shape[2]))
+        for first in range(0, shape[0], step):
+            part = self._read(first, min(first + step, shape[0]))
             checked_light(part, part.shape, f"{path}, frames {first} to {first + len(part) - 1},")
 
     @property
     def count(self) -> int:
-        return len(self._video)
+        return self._shape[0]
 
     def frame(self, index: int) -> Light:
-        frame: Light = np.asarray(self._video[index], np.float32) / np.float32(self._white)
+        frame: Light = self._read(index, index + 1)[0].astype(np.float32) / np.float32(self._white)
         return frame
+
+    def _read(self, first: int, stop: int) -> NDArray[Any]:
+        """Return some frames. Raises DataError for a file that has changed: its lines would be of two."""
+        if self._whole is not None:
+            return self._whole[first:stop]
+        values = self._shape[1] * self._shape[2]
+        begin = self._offset + first * values * self._dtype.itemsize
+        try:
+            found = np.fromfile(self._path, self._dtype, (stop - first) * values, offset=begin)
+            changed = _version(self._path) != self._version
+        except OSError as error:
+            raise DataError(f"{self._path}: frame {first} cannot be read: {error}") from error
+        if changed or len(found) < (stop - first) * values:
+            raise DataError(f"{self._path} has changed while it was shown", hint="arm again")
+        frames: NDArray[Any] = found.reshape(stop - first, *self._shape[1:])
+        return frames
+
+
+def _version(path: Path) -> tuple[int, int, int]:
+    """Return what tells a file from one that has replaced it or was written anew."""
+    found = path.stat()
+    return found.st_ino, found.st_size, found.st_mtime_ns
 
 
 class _PictureFile:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+
 import av
 import numpy as np
 import pytest
@@ -48,6 +50,31 @@ def test_an_array_is_shown_frame_by_frame_in_a_loop(tmp_path):
     blended = shown(tmp_path / "v.npy", frame_rate_hz=500.0).frames(0, 2)
     expected = [0.75 * video[0] + 0.25 * video[1], 0.25 * video[0] + 0.75 * video[1]]
     np.testing.assert_allclose(blended, expected, rtol=1e-5)
+
+
+def test_an_array_in_fortran_order_is_shown_as_any_other(tmp_path):
+    video = RNG.integers(0, 256, (4, 6, 8), dtype=np.uint8)
+    np.save(tmp_path / "c.npy", video)
+    np.save(tmp_path / "f.npy", np.asfortranarray(video))
+    frames = [shown(tmp_path / name, frame_rate_hz=500.0).frames(0, 8) for name in ("c.npy", "f.npy")]
+    np.testing.assert_array_equal(*frames)
+
+
+@pytest.mark.parametrize("change", ["cut short", "written anew", "removed"])
+def test_an_array_that_changes_while_it_is_shown_is_told(tmp_path, change):
+    """One that was mapped ended the process (SIGBUS) when it was cut short."""
+    path = tmp_path / "v.npy"
+    video = RNG.random((200, 64, 64)).astype(np.float32)
+    np.save(path, video)
+    scene = shown(path, frame_rate_hz=1000.0)
+    if change == "cut short":
+        os.truncate(path, 4096)
+    elif change == "written anew":
+        np.save(path, video[:100])
+    else:
+        path.unlink()
+    with pytest.raises(DataError, match=r"v\.npy(: frame 100 cannot be read| has changed while)"):
+        scene.frames(100, 1)
 
 
 def test_only_a_few_frames_are_kept(tmp_path):
@@ -105,6 +132,8 @@ def bad_files(tmp_path):
     (tmp_path / "noise.mp4").write_bytes(RNG.bytes(5000))
     (tmp_path / "cut.npy").write_bytes((tmp_path / "flat.npy").read_bytes()[:40])
     (tmp_path / "objects.npy").write_bytes(b"\x93NUMPY\x01\x00")
+    with (tmp_path / "archive.npy").open("wb") as archive:
+        np.savez(archive, a=np.zeros(3))
     Image.fromarray(np.zeros((64, 64), np.uint8)).save(tmp_path / "cut.png")
     whole = (tmp_path / "cut.png").read_bytes()
     (tmp_path / "cut.png").write_bytes(whole[: len(whole) // 2])
@@ -122,6 +151,7 @@ def bad_files(tmp_path):
         ("noise.mp4", "neither a picture nor a video"),
         ("cut.npy", "not an array"),
         ("objects.npy", "not an array"),
+        ("archive.npy", "not an array"),
         ("cut.png", "cut.png"),
         ("missing.mp4", "does not exist"),
     ],
