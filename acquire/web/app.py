@@ -16,7 +16,7 @@ from starlette.staticfiles import StaticFiles
 from acquire.daemon.answers import Answers
 from acquire.daemon.control import new_app
 from acquire.daemon.messages import ErrorMessage
-from acquire.daemon.routes import NO_STORE, routes
+from acquire.daemon.routes import NO_STORE, RequestId, routes
 from acquire.errors import UsageError
 from acquire.web.archive import Archive
 from acquire.web.calibrations import calibration_facts, place_of
@@ -115,11 +115,12 @@ def build_page(
         lifespan=lifespan,
     )
     api = APIRouter(prefix="/api", responses=WHY_REFUSED)
-    api.include_router(routes(Passing(hub), Answers()))
+    answers = Answers()
+    api.include_router(routes(Passing(hub), answers))
     _add_stream(api, Pages(hub))
-    _add_recordings(api, archive, reading)
-    _add_jobs(api, jobs)
-    _add_calibration(api, hub, jobs, directory, reading)
+    _add_recordings(api, archive, reading, answers)
+    _add_jobs(api, jobs, answers)
+    _add_calibration(api, hub, jobs, directory, reading, answers)
     guard = Guard(app, tokens, names)
     _add_session(api, guard, tokens, secure=secure)
     app.include_router(api)
@@ -181,7 +182,7 @@ def _add_stream(api: APIRouter, pages: Pages) -> None:
         return StreamingResponse(stream, media_type="application/octet-stream", headers=NO_STORE)
 
 
-def _add_recordings(api: APIRouter, archive: Archive, reading: Reading) -> None:
+def _add_recordings(api: APIRouter, archive: Archive, reading: Reading, answers: Answers) -> None:
     @api.get("/recordings", summary="Recordings, newest first")
     async def recordings() -> list[RecordingFacts]:
         return await reading(archive.recordings)
@@ -201,9 +202,12 @@ def _add_recordings(api: APIRouter, archive: Archive, reading: Reading) -> None:
         return Response(content, media_type="image/png", headers=NO_STORE)
 
     @api.post("/recordings/{name}/hold", summary="Protect lines from retention")
-    async def hold(name: str, asked: HoldRequest) -> RecordingDetail:
-        await reading(lambda: archive.hold(name, asked))
-        return await reading(lambda: archive.recording(name))
+    async def hold(name: str, asked: HoldRequest, request_id: RequestId = None) -> RecordingDetail:
+        async def work() -> RecordingDetail:
+            await reading(lambda: archive.hold(name, asked))
+            return await reading(lambda: archive.recording(name))
+
+        return await answers.once(request_id, f"hold {name} {asked}", work)
 
     @api.get("/videos", summary="Reconstructed videos, newest first")
     async def videos() -> list[VideoFacts]:
@@ -231,26 +235,34 @@ def _add_recordings(api: APIRouter, archive: Archive, reading: Reading) -> None:
         return FileResponse(path, media_type="application/octet-stream", filename=name)
 
 
-def _add_jobs(api: APIRouter, jobs: Jobs) -> None:
+def _add_jobs(api: APIRouter, jobs: Jobs, answers: Answers) -> None:
     @api.get("/jobs", summary="Jobs, newest first")
     async def list_jobs() -> list[JobFacts]:
         return jobs.list()
 
     @api.post("/jobs", summary="Reconstruct, preview or cut a range of a recording")
-    async def add(asked: JobRequest) -> JobFacts:
-        return jobs.add(asked)
+    async def add(asked: JobRequest, request_id: RequestId = None) -> JobFacts:
+        async def work() -> JobFacts:
+            return jobs.add(asked)
+
+        return await answers.once(request_id, f"job {asked}", work)
 
     @api.delete("/jobs/{number}", summary="Stop a job")
     async def stop(number: int) -> JobFacts:
         return await jobs.stop(number)
 
 
-def _add_calibration(api: APIRouter, hub: Hub, jobs: Jobs, directory: Path, reading: Reading) -> None:
+def _add_calibration(
+    api: APIRouter, hub: Hub, jobs: Jobs, directory: Path, reading: Reading, answers: Answers
+) -> None:
     @api.get("/calibration", summary="The calibration: its steps and their findings")
     async def calibration() -> CalibrationFacts:
         place, named = place_of(directory, hub.setup)
         return await reading(lambda: calibration_facts(place, named=named))
 
     @api.post("/calibration", summary="Carry out a calibration step, as a job")
-    async def calibrate(asked: CalibrationRequest) -> JobFacts:
-        return jobs.calibrate(asked, place_of(directory, hub.setup)[0])
+    async def calibrate(asked: CalibrationRequest, request_id: RequestId = None) -> JobFacts:
+        async def work() -> JobFacts:
+            return jobs.calibrate(asked, place_of(directory, hub.setup)[0])
+
+        return await answers.once(request_id, f"calibrate {asked}", work)

@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING
 import pytest
 
 sys.path[:0] = [
-    str(Path(__file__).parents[1] / name) for name in ("daemon", "service", "evaluate")
-]  # their fake and real daemons, and the demo's result
+    str(Path(__file__).parents[1] / name) for name in ("daemon", "service", "evaluate", "store")
+]  # their fake and real daemons, the demo's result, and recordings
 
 if TYPE_CHECKING:
     from playwright.sync_api import Browser

@@ -10,8 +10,16 @@ import sys
 from pathlib import Path
 from typing import Any
 
+import httpx
 import pytest
+from fake_run import FakeRun, rig_config
+from page_server import PageServer
+from served import api
+from store_helpers import fill, make_spec
 
+from acquire.daemon.endpoint import Endpoint
+from acquire.daemon.service import Service
+from acquire.store import RecordingWriter, RunCondition
 from acquire.web import glimpser, jobs, worker
 from acquire.web.messages import JobFacts, JobRequest
 
@@ -77,3 +85,34 @@ def test_glimpses_come_once_a_process_can_be_started_again(monkeypatch: pytest.M
         return owner.number
 
     assert asyncio.run(watch()) >= 1
+
+
+def test_a_request_that_is_repeated_is_carried_out_once(tmp_path: Path) -> None:
+    """As a script does whose connection broke before the answer came."""
+    service, socket = Service(rig_config(tmp_path), lambda _: FakeRun()), tmp_path / "c.sock"
+    with (
+        contextlib.closing(Endpoint(socket)) as endpoint,
+        api(service, endpoint),
+        contextlib.closing(PageServer(socket, tmp_path)) as page,
+        RecordingWriter.create(tmp_path / "r.zarr", make_spec()) as writer,
+        httpx.Client(
+            base_url=f"{page.address}api", headers={"Authorization": f"Bearer {page.operator}"}
+        ) as ask,
+    ):
+        fill(writer, 150)
+        writer.commit()
+        lines = {"first_line": 1000, "lines": 20}
+        for path, asked in (
+            ("/jobs", {"kind": "cut", "recording": "r.zarr", **lines}),
+            ("/recordings/r.zarr/hold", {"why": "x", **lines}),
+            ("/calibration", {"step": "dark"}),
+        ):
+            headers = {"Request-Id": path}
+            first = ask.post(path, json=asked, headers=headers)
+            assert first.status_code == 200, first.text
+            if path.endswith("hold"):  # afterwards it would be refused
+                writer.seal(RunCondition.GOOD, "done", {})
+            assert ask.post(path, json=asked, headers=headers).json() == first.json()
+            other = ask.post(path, json={**asked, "lines": 4000}, headers=headers)
+            assert "was given to another request before" in other.json()["message"]
+        assert sorted(job["kind"] for job in ask.get("/jobs").json()) == ["calibrate", "cut"]
