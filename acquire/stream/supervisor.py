@@ -217,8 +217,22 @@ class Supervisor:
     def wait_sealed(self, deadline: float) -> bool:
         """Wait until the recording is closed or lost, or the monotonic ``deadline``; return whether it is."""
         with self._news:
-            self._news.wait_for(lambda: not self.recording, max(0.0, deadline - time.monotonic()))
+            while self.recording and time.monotonic() < deadline:
+                # Whoever waits reads for a thread that a defect has ended: the recorder seals all the same.
+                if not self._thread.is_alive() and not self._read_last_words():
+                    break
+                self._news.wait(_TAG_WAIT_S)
             return not self.recording
+
+    def _read_last_words(self) -> bool:
+        """Read the recorder's messages in place of the thread; return whether that was possible."""
+        try:
+            self._workers[RECORDER].flush()
+            self._read_messages(RECORDER, self._workers[RECORDER])
+        except Exception as error:  # noqa: BLE001 - perhaps the defect that has ended the thread
+            self._fail(f"supervisor: {type(error).__name__}: {error}")
+            return False
+        return True
 
     def _run(self) -> None:
         try:

@@ -459,6 +459,21 @@ def test_a_run_that_the_trigger_s_watchdog_ended_is_a_fault(tmp_path: Path) -> N
     assert "watchdog" in recording.attrs["end_reason"]
 
 
+def test_a_defect_that_ends_the_supervisor_costs_no_recording(tmp_path: Path) -> None:
+    """Its recorder seals it at the fault; nobody read that, and it was given up as not sealed in time."""
+    bench = make_bench()
+    with armed(bench) as capture:
+        record_until(capture, tmp_path / "r.zarr", 1000)
+        bench.trigger.told = [object()]  # type: ignore[list-item] - the defect of a driver
+        until(lambda: capture.poll().fault, "the fault")
+        assert "supervisor: AttributeError" in str(capture.poll().fault)
+        capture.close()
+        seen = capture.poll()
+        assert (seen.done, seen.condition, seen.orphans) == (True, RunCondition.INTERRUPTED, ())
+    recording = open_recording(tmp_path / "r.zarr")
+    assert (recording.state, recording.lines) == ("sealed", seen.recorded_lines)
+
+
 def test_a_supervisor_that_its_trigger_holds_up_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
     bench, returns = make_bench(), threading.Event()
     with armed(bench) as capture:
