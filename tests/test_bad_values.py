@@ -99,6 +99,40 @@ def test_of_simulations(tmp_path: Path) -> None:
     assert not list(tmp_path.iterdir())
 
 
+OF_CLIENTS: dict[str, tuple[Callable[[Any], Any], str]] = {
+    "lines": (lambda c: c.start(lines=-5), r"start: lines = -5: Input should be greater"),
+    "seconds": (
+        lambda c: c.start(duration_s="x"),
+        r"start: duration_s = 'x': Input should be a valid number",
+    ),
+    "two": (lambda c: c.start(lines=5, duration_s=1.0), r"^start: lines and duration_s exclude each other"),
+    "path": (lambda c: c.start(5), r"start: path = 5: Input is not a valid path"),
+    "code": (lambda c: c.arm(code="blue"), r"arm: code = 'blue': Input should be 'rig', 'dark' or 'steady'"),
+    "delays": (lambda c: c.arm(delays={"a": 1}), r"^arm: delays\.light_lead: Field required"),
+    "text": (lambda c: c.mark(5), r"mark: text = 5: Input should be a valid string"),
+    "id": (
+        lambda c: c.mark("", request_id="a b"),
+        r"mark: request_id = 'a b' is not a request id; possible: 1 to",
+    ),
+    "id of news": (lambda c: next(c.events("€")), r"last_id = '€' is not the id of news"),
+    "state": (
+        lambda c: c.wait({"ready"}, 1),
+        r"wait: 'ready' is not a state to wait for; possible: idle, armed",
+    ),
+    "no state": (lambda c: c.wait((), 1), r"wait: there is no state to wait for"),
+    "address": (lambda _: Client(5), r"^5 is not a valid address; possible"),  # type: ignore[arg-type]
+    "token": (lambda _: Client("http://x", token="a\nb"), r"^the token is not text that a header can hold"),
+}
+
+
+@pytest.mark.parametrize("name", OF_CLIENTS)
+def test_of_clients(name: str, tmp_path: Path) -> None:
+    """Before anything is sent: nobody listens."""
+    make, words = OF_CLIENTS[name]
+    with pytest.raises(UsageError, match=words):
+        make(Client(tmp_path / "none.sock"))
+
+
 @pytest.mark.parametrize("place", ["http://[::1", "ftp://host:80", "http://host:99999", "http://"])
 def test_of_addresses(place: str) -> None:
     with pytest.raises(UsageError, match="is not a valid address; possible: http://HOST:PORT, or a socket"):

@@ -183,8 +183,10 @@ class Client:
     def wait(self, states: Collection[State], timeout_s: float) -> Status:
         """Wait until the daemon is in one of ``states``, and return its status.
 
-        Raises StateError when the time is up, and at once if a fault keeps the daemon from getting there.
+        Raises StateError when the time is up, and at once if a fault keeps the daemon from getting there;
+        UsageError for what is not a state, which would be waited for in vain.
         """
+        states = core.states_of(states)
         deadline = time.monotonic() + timeout_s
         while (status := self.status()).state not in states:
             wanted = " or ".join(states)

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import secrets
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -21,19 +22,21 @@ from pydantic import BaseModel, ValidationError
 
 from acquire.daemon.facts import News
 from acquire.daemon.messages import (
+    LONGEST_ID,
     ArmRequest,
     ErrorMessage,
     MarkRequest,
     StartRequest,
     Status,
 )
+from acquire.daemon.states import State
 from acquire.daemon.who import HEADER, WHO
 from acquire.errors import AcquireError, UsageError
 from acquire.place import default_socket
-from acquire.text import own_words, shortened
+from acquire.text import own_words, shortened, shown
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Collection, Iterator
 
 CONNECT_TIMEOUT_S = 5.0
 STATUS_TIMEOUT_S = 10.0
@@ -51,8 +54,16 @@ API = "/api"
 BAD = 400
 """Lowest HTTP status that is an error."""
 
+_ID = re.compile(rf"[!-~]{{1,{LONGEST_ID}}}")
+_TOKEN = re.compile(r"[ -~]+")
+
 T = TypeVar("T", bound=BaseModel)
 R = TypeVar("R", bound=BaseModel)
+
+
+def _fits(pattern: re.Pattern[str], value: object) -> bool:
+    """Return whether a value is a text that a header can hold."""
+    return isinstance(value, str) and pattern.fullmatch(value) is not None
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,6 +79,8 @@ class Target:
     @classmethod
     def of(cls, place: Path | str | None, token: str | None = None) -> Target:
         """Return the target for a socket's path, a URL, or None for the default socket."""
+        if not (place is None or isinstance(place, str | Path)):
+            raise _no_address(shown(place))
         text = "" if place is None else str(place)
         if not text.startswith(("http://", "https://")):
             # Path would make "ftp:/..." of it: a file that nobody meant.
@@ -83,6 +96,9 @@ class Target:
             raise _no_address(text)
         tls = parts.scheme == "https"
         token = token or os.environ.get(TOKEN_VARIABLE)
+        if token is not None and not _fits(_TOKEN, token):
+            # It is a secret, and not shown.
+            raise UsageError("the token is not text that a header can hold", hint="acquire web --link")
         return cls(None, parts.hostname, port, tls, token)
 
     def __str__(self) -> str:
@@ -152,7 +168,15 @@ def fact(name: str, answer: type[T]) -> Call[T]:
 def command(
     name: str, answer: type[T], body: BaseModel | None = None, request_id: str | None = None
 ) -> Call[T]:
-    """Return a command; it gets a request id unless the caller has one, so that it can be sent again."""
+    """Return a command; it gets a request id unless the caller has one, so that it can be sent again.
+
+    Raises UsageError for an id that no header can hold.
+    """
+    if request_id is not None and not _fits(_ID, request_id):
+        raise UsageError(
+            f"{name}: request_id = {shown(request_id)} is not a request id",
+            possible=f"1 to {LONGEST_ID} printable ASCII characters without spaces",
+        )
     return Call("POST", name, answer, body, request_id=request_id or secrets.token_hex(16))
 
 
@@ -162,8 +186,8 @@ def arm(*, request_id: str | None, **how: Any) -> Call[Status]:
 
 def start(path: Path | str | None, request_id: str | None, **budget: Any) -> Call[Status]:
     """Return the command; a relative ``path`` is relative to the caller's directory."""
-    # The daemon has another working directory.
-    absolute = None if path is None else Path(path).absolute()
+    # The daemon has another working directory. Anything else than a path is refused by the model.
+    absolute = Path(path).absolute() if isinstance(path, str | os.PathLike) else path
     return command("start", Status, request("start", StartRequest, path=absolute, **budget), request_id)
 
 
@@ -178,8 +202,21 @@ def request(command: str, model: type[R], **fields: Any) -> R:
     except ValidationError as error:
         first = error.errors()[0]
         where = ".".join(map(str, first["loc"]))
-        why = own_words(first["msg"])
-        raise UsageError(shortened(f"{command}: {where} {why}".replace("  ", " "), 1000)) from error
+        # Fields that exclude each other have no place, and name themselves; what is missing has no value.
+        value = "" if first["type"] == "missing" else f" = {shown(first['input'])}"
+        what = f"{where}{value}: " if where else ""
+        raise UsageError(shortened(f"{command}: {what}{own_words(first['msg'])}", 1000)) from error
+
+
+def states_of(states: Collection[State] | State) -> tuple[State, ...]:
+    """Return the states to wait for. Raises UsageError if there are none, or for one that does not exist."""
+    asked = (states,) if isinstance(states, str) else tuple(states)
+    known = tuple(State)
+    unknown = [state for state in asked if state not in known]
+    if unknown or not asked:
+        what = f"{shown(unknown[0])} is not a state" if unknown else "there is no state"
+        raise UsageError(f"wait: {what} to wait for", possible=", ".join(known))
+    return tuple(map(State, asked))
 
 
 def events_path(target: Target, *, history: bool, status_s: float | None) -> str:
@@ -201,6 +238,9 @@ class EventReader:
     """
 
     def __init__(self, last_id: str | None = None) -> None:
+        """Begin after the news ``last_id``. Raises UsageError for what cannot be the id of news."""
+        if last_id is not None and not _fits(_ID, last_id):
+            raise UsageError(f"last_id = {shown(last_id)} is not the id of news", possible="`News.id`")
         self.last_id = last_id
         self.begin()
 

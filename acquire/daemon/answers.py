@@ -20,7 +20,6 @@ T = TypeVar("T")
 
 MOST_KEPT = 256
 """Number of answers that are kept; the oldest is dropped first."""
-LONGEST_ID = 128
 
 
 @dataclass(slots=True)

@@ -29,6 +29,8 @@ LONGEST_NAME = 200
 """Longest name of a recording in bytes: names derived from it, such as a further segment's, are longer."""
 LONGEST_MARK = 400
 """Longest text of a mark, in characters."""
+LONGEST_ID = 128
+"""Longest id of a request."""
 
 
 class Message(BaseModel):

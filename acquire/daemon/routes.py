@@ -11,9 +11,10 @@ from typing import Annotated, Any, Protocol
 from fastapi import APIRouter, Depends, Header, Query, Response
 from fastapi.responses import StreamingResponse
 
-from acquire.daemon.answers import LONGEST_ID, Answers
+from acquire.daemon.answers import Answers
 from acquire.daemon.facts import Health, Reloaded, Rings, Setup, Version
 from acquire.daemon.messages import (
+    LONGEST_ID,
     ArmRequest,
     CapacityStatus,
     MarkRequest,
