@@ -121,6 +121,13 @@ def flat(
     trusted = usable & ~edges
     if known.usable is not None:
         trusted &= known.usable
+    if not trusted.any(axis=1).all():
+        arm = ARMS[int(np.argmin(trusted.any(axis=1)))]
+        raise UsageError(
+            f"{exposure.recording}: no column of arm {arm} is left for a gain: all are excluded",
+            possible="a column that the dark has not excluded, with light",
+            hint="acquire calibrate show",
+        )
     level = np.array([row[good].mean() for row, good in zip(shape, trusted, strict=True)])[:, None]
     arms = np.array([row[good].mean() for row, good in zip(response, trusted, strict=True)])
     error = np.hypot(
@@ -187,6 +194,9 @@ def _blurred_edges(
     outermost[:, [0, -1]] = True
     witnesses = outermost & usable
     inner = usable & ~outermost
+    if not inner.any(axis=1).all():
+        # One or two columns are all at an edge: there is nothing to compare them with.
+        return np.zeros_like(usable)
     middle = np.array([[np.median(row[good])] for row, good in zip(shape, inner, strict=True)])
     lack, spread = 1 - shape / middle, _spread(shape, inner)
     of_one_arm = [witnesses & arm[:, None] for arm in np.eye(len(shape), dtype=bool)]

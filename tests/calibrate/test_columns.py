@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -229,3 +230,27 @@ def test_a_block_that_lost_nearly_all_lines_is_neither_dark_nor_a_drift(
     assert found.mean == pytest.approx(whole.mean, abs=6 * np.sqrt(whole.variance.max()) / BLOCK_LINES)
     assert found.variance == pytest.approx(whole.variance, rel=0.05)
     assert np.median(found.drift) < 3
+
+
+@pytest.mark.parametrize("stages", [1, 2])
+def test_a_flat_of_columns_that_are_all_at_an_edge(tmp_path: Path, stages: int) -> None:
+    """There are no others to compare them with: numpy warned of the mean of nothing."""
+    changes = {"geometry.stages": stages}
+    changes |= {f"cameras.{arm}.responsivity_dn": 192.0 / stages for arm in ARMS}
+    scene = white(effects=[*NOISE, *COLUMNS])
+    paths = [record(tmp_path / f"{each}.zarr", scene, each, **changes) for each in ("dark", "flat")]
+    for smooth in (False, True):
+        first = dark(open_exposure(paths[0]))
+        known = Calibration(first.instrument).with_step(first)
+        gain = flat(open_exposure(paths[1]), known, smooth=smooth).quantities["gain"]
+        np.testing.assert_allclose(gain.value.mean(axis=1), 1)
+        assert np.isfinite(gain.uncertainty).all()
+
+
+def test_a_flat_of_an_arm_without_a_column_is_refused(
+    recordings: dict[str, Path], known: Calibration
+) -> None:
+    none_of_b = np.ones((2, 24), bool)
+    none_of_b[1] = False
+    with pytest.raises(UsageError, match="no column of arm b is left for a gain"):
+        flat(open_exposure(recordings["flat"]), replace(known, usable=none_of_b))
