@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from scipy.ndimage import uniform_filter1d
 
-from acquire.forward import column_merging
+from acquire.forward import blurring, column_merging, registration
 from acquire.recon.basis import TemporalBasis
 
 if TYPE_CHECKING:
@@ -53,13 +53,14 @@ def fit_brightness(
     geometry, frames = segment.geometry, len(video)
     n, S = geometry.size, geometry.substeps
     basis = TemporalBasis(frames, cosines).matrix().astype(np.float64)
-    frame, row = np.arange(geometry.span) // temporal_merge, np.arange(n) // spatial_merge
+    frame = np.arange(geometry.span) // temporal_merge
     lit = (basis[:, frame] * segment.code).T.astype(np.float32)
     merging = column_merging(geometry, spatial_merge).astype(np.float32)
     normal, right, energy, samples = np.zeros((cosines, cosines)), np.zeros(cosines), 0.0, 0
     # arm B's rows are the scene's columns from right to left
-    for arm, view in enumerate((video, video.transpose(0, 2, 1)[:, ::-1])):
-        pixels = view.astype(np.float32) @ merging
+    blocks = (np.arange(n) // spatial_merge, np.arange(n)[::-1] // spatial_merge)
+    for arm, (view, row) in enumerate(zip(_views(segment, video, spatial_merge), blocks, strict=True)):
+        pixels = view @ merging
         for line in np.flatnonzero((problem.weight[arm] > 0).any(axis=1)):
             used = problem.weight[arm, line] > 0
             seen = np.zeros((len(used), cosines), np.float32)
@@ -82,6 +83,20 @@ def fit_brightness(
     change = _most_likely(normal, right - normal @ flat, left, samples)
     brightness = np.maximum(basis.T @ (flat + change), DIMMEST)
     return np.asarray(brightness / brightness.mean())
+
+
+def _views(segment: Segment, video: NDArray[Any], spatial_merge: int) -> tuple[NDArray[Any], NDArray[Any]]:
+    """Return the video as each arm's sensor has it (time, block along the charge, block across)."""
+    alignment, blur, geometry = segment.alignment, segment.blur, segment.geometry
+    # a picture that does not change is one frame, repeated without being copied
+    frames = video[:1] if video.strides[0] == 0 else video
+    view_a = view_b = np.ascontiguousarray(frames, np.float32)
+    if (moved := registration(alignment, geometry, spatial_merge)) is not None:
+        view_b = moved.forward(view_b)
+    if (blurred := blurring(blur, geometry, spatial_merge)) is not None:
+        view_a, view_b = blurred.forward(0, view_a), blurred.forward(1, view_b)
+    a, b = (np.broadcast_to(view, video.shape) for view in (view_a, view_b))
+    return a, b.transpose(0, 2, 1)
 
 
 def _most_likely(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import cache
 from threading import Event
 
@@ -10,6 +11,8 @@ import pytest
 from hypothesis import given, settings
 from recon_cases import Wall, cases
 
+from acquire.alignment import Alignment
+from acquire.blur import Blur
 from acquire.codes import mix_seed, prbs
 from acquire.evaluate.metrics import psnr
 from acquire.forward import DualArm, merge_video
@@ -213,6 +216,28 @@ def test_brightness_is_fitted_to_a_known_picture_with_any_number_of_cosines(cosi
     frames = GEOMETRY.trusted_frames(1)
     wanted = BRIGHTNESS / BRIGHTNESS.mean()
     assert np.abs(found - wanted)[frames].max() < 0.05
+
+
+@pytest.mark.parametrize("merge", [3, 5])  # 5 does not divide 48: arm B's first block is the short one
+@pytest.mark.parametrize(
+    ("alignment", "blur"), [(None, None), (Alignment(rows=4.0, columns=-3.0), Blur((1.5, 0.0), (3.0, 2.0)))]
+)
+def test_brightness_is_fitted_to_what_each_arm_sees(
+    alignment: Alignment | None, blur: Blur | None, merge: int
+) -> None:
+    side = GEOMETRY.video_shape(merge, 1)[1]
+    picture = np.random.default_rng(4).random((side, side), np.float32)
+    flickering = (BRIGHTNESS[:, None, None] * picture).astype(np.float32)
+    lines = DualArm(GEOMETRY, CODE, merge, 1, alignment=alignment, blur=blur).forward(flickering)
+    seen = replace(
+        segment("still"), lines=lines, responsivity_dn=1.0, code=CODE, alignment=alignment, blur=blur
+    )
+    problem = build_problem(seen, merge, 1, hold_out=0.08)
+    video = np.broadcast_to(picture / problem.scale, flickering.shape)
+    for one in (video, video.copy()):
+        found = fit_brightness(seen, problem, one, (merge, 1), 40)
+        wanted = BRIGHTNESS / BRIGHTNESS.mean()
+        assert np.abs(found - wanted)[GEOMETRY.trusted_frames(1)].max() < 0.02
 
 
 def test_light_beyond_the_band_stands_out_of_the_residual() -> None:
