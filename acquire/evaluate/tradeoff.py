@@ -253,7 +253,10 @@ def measure(
         dtype=dtype,
         refuse=False,
         look=look,
-        check=False,  # the search for better explanations of the lines is not part of the solver's time
+        # What explains the lines better, and how large the error is, take no part of the solver's time: the
+        # points before the end come without them.
+        check=False,
+        error=False,
     )
     prediction = None if np.isnan(result.quality.prediction) else result.quality.prediction
     last = Point(result.iterations, result.seconds, result.processor_s, "end", prediction=prediction)

@@ -68,6 +68,16 @@ def test_a_run_that_exceeds_its_budget_is_marked_as_cut(judge):
     assert not replace(short, ended="converged").cut
 
 
+def test_the_end_of_a_run_has_the_time_of_its_solver_alone(judge, monkeypatch):
+    """Results before the end come without an estimate of their error."""
+
+    def estimate(*_, **__):
+        raise AssertionError("the error was estimated")
+
+    monkeypatch.setattr("acquire.recon.api.estimate_error", estimate)
+    assert measure(judge, "admm", VOXELS, "fast").end.psnr_db is not None
+
+
 def test_a_real_recording_has_no_truth(judge):
     blind = measure(Judge(judge.segment, None), "admm", VOXELS, "fast")
     assert blind.end.psnr_db is None
