@@ -11,10 +11,11 @@ import errno
 import json
 import os
 import stat
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
-if TYPE_CHECKING:
-    from pathlib import Path
+from acquire.errors import PlaceError
+from acquire.text import shown
 
 MOST_BYTES = 2**26
 """Size limit of a document or table that is read whole; the largest that acquire writes is a few MB."""
@@ -34,6 +35,13 @@ _KINDS = (
     (stat.S_ISCHR, "a device"),
     (stat.S_ISBLK, "a device"),
 )
+
+
+def path_of(place: object) -> Path:
+    """Return the path that a caller gave as a Path or a text. Raises PlaceError for anything else."""
+    if not isinstance(place, str | os.PathLike) or "\0" in str(place):
+        raise PlaceError(f"{shown(place)} cannot be a path", possible="a Path, or text without a zero byte")
+    return Path(place)
 
 
 def kind_of(mode: int) -> str | None:

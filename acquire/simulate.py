@@ -17,15 +17,19 @@ import numpy as np
 from acquire import __version__
 from acquire.calibrate.choose import carried_calibration
 from acquire.clock import ClockFit
+from acquire.config import RigConfig
+from acquire.config.scene import SceneBase
 from acquire.errors import AcquireError, UsageError
 from acquire.geometry import check_integers
 from acquire.lines import ARMS, LineBlock, LineFlag
 from acquire.noise import QUANTISATION_DN2
+from acquire.reading import path_of
 from acquire.sim.pipeline import Bench, describe
 from acquire.sim.stopwatch import Stopwatch
 from acquire.store import RecordingSpec, RecordingWriter, RunCondition
 from acquire.stream.losses import Cause
 from acquire.stream.tagger import Tagger
+from acquire.text import shown
 from acquire.trigger.base import TriggerRun
 
 if TYPE_CHECKING:
@@ -36,7 +40,6 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from acquire.codes import Code
-    from acquire.config import RigConfig
     from acquire.config.scene import SceneConfig
     from acquire.sim.pipeline import Camera
     from acquire.sim.readout import Readout
@@ -117,10 +120,19 @@ def layout_of(config: RigConfig, scene: SceneConfig) -> str:
     return scene.optics.layout if config.fibre is None else config.cameras.layout
 
 
+def _check_models(config: object, scene: object) -> None:
+    """Raise UsageError for the names of a rig and a scene in place of what they stand for."""
+    for given, kind, load in ((config, RigConfig, "load_rig"), (scene, SceneBase, "load_scene")):
+        if not isinstance(given, kind):
+            raise UsageError(
+                f"{shown(given)} cannot be simulated", possible=f"a {kind.__name__}", hint=f"{load}(...)"
+            )
+
+
 def simulate(
     config: RigConfig,
     scene: SceneConfig,
-    path: Path,
+    path: Path | str,
     lines: int,
     progress: Callable[[int, int], object] = lambda _done, _total: None,
 ) -> Simulated:
@@ -129,6 +141,8 @@ def simulate(
     Everything that can be refused is refused with a UsageError before ``path`` exists. A later failure or
     interruption leaves a sealed recording that states it.
     """
+    _check_models(config, scene)
+    path = path_of(path)
     check_integers(lines=lines)
     if not 1 <= lines <= MOST_SIMULATED_LINES:
         raise UsageError(

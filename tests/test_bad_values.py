@@ -18,7 +18,7 @@ from acquire.recon import reconstruct
 from acquire.recon.segments import Voxels
 from acquire.reconstruct import by_lines, by_time, in_glimpses, in_voxels
 from acquire.simulate import bench_of, simulate, study
-from acquire.store import Recording, open_recording
+from acquire.store import Recording, mirror, open_recording, open_video, recover, verify
 
 PRBS = PrbsCode.from_seed(16, 1)
 LISTED = ListedCode.of(np.array([1, 0, 1], np.uint8))
@@ -88,6 +88,48 @@ def test_of_lines(recording: Recording, name: str) -> None:
     make, words = OF_LINES[name]
     with pytest.raises(UsageError, match=words):
         make(recording)
+
+
+OF_TYPES: dict[str, tuple[Callable[[Any], Any], str]] = {
+    "recording": (lambda _: open_recording(5), "^5 cannot be a path; possible: a Path, or text"),  # type: ignore[arg-type]
+    "bytes": (lambda _: open_recording(b"x"), "^b'x' cannot be a path"),  # type: ignore[arg-type]
+    "zero": (lambda _: open_recording("a\0b"), r"^'a\\x00b' cannot be a path"),
+    "video": (lambda _: open_video(None), "^None cannot be a path"),  # type: ignore[arg-type]
+    "verify": (lambda _: verify(5), "^5 cannot be a path"),  # type: ignore[arg-type]
+    "recover": (lambda _: recover(5), "^5 cannot be a path"),  # type: ignore[arg-type]
+    "mirror": (lambda _: mirror(5, "memory://x"), "^5 cannot be a path"),  # type: ignore[arg-type]
+    "rig": (lambda _: load_rig(5), "^5 cannot be a rig file; possible: a path"),  # type: ignore[arg-type]
+    "scene": (lambda _: load_scene(None), "^None cannot be a scene file; possible"),  # type: ignore[arg-type]
+    "overrides": (lambda _: load_rig("rig-demo", ["x=1"]), r"^\['x=1'\] cannot override"),  # type: ignore[arg-type]
+    "key": (lambda _: load_rig("rig-demo", {5: 5}), "^{5: 5} cannot override"),  # type: ignore[dict-item]
+    "lines of": (lambda _: by_lines("r"), "^lines of 'r' cannot be selected; .*try: open_recording"),  # type: ignore[arg-type]
+    "time": (lambda r: by_time(r, "5", None), "begin_ns cannot be '5'; possible"),  # type: ignore[arg-type]
+    "length": (lambda r: in_voxels(by_lines(r), Voxels(6, 10), longest="5"), "longest cannot be '5'; poss"),  # type: ignore[arg-type]
+    "number": (lambda r: in_glimpses(by_lines(r), Voxels(6, 10), "5"), "count cannot be '5'; possible"),  # type: ignore[arg-type]
+}
+
+
+@pytest.mark.parametrize("name", OF_TYPES)
+def test_of_types(recording: Recording, name: str) -> None:
+    make, words = OF_TYPES[name]
+    with pytest.raises(UsageError, match=words):
+        make(recording)
+
+
+def test_of_models_and_paths(tmp_path: Path) -> None:
+    rig, scene = load_rig("rig-demo", {"geometry.stages": 8}), load_scene("scene-leds")
+    for given, words in (
+        (("rig-demo", scene, tmp_path / "r.zarr"), r"^'rig-demo' cannot be simulated; .*try: load_rig\("),
+        ((rig, "scene-leds", tmp_path / "r.zarr"), r"^'scene-leds' cannot be simulated; .*try: load_scene\("),
+        ((rig, scene, 5), "^5 cannot be a path"),
+    ):
+        with pytest.raises(UsageError, match=words):
+            simulate(*given, 60)  # type: ignore[arg-type]
+    assert not list(tmp_path.iterdir())
+    # a text is as good as a Path
+    simulate(rig, scene, f"{tmp_path}/r.zarr", 60)
+    assert mirror(f"{tmp_path}/r.zarr", f"file://{tmp_path}/far.zarr").sealed
+    assert not recover(f"{tmp_path}/far.zarr").damage
 
 
 def test_of_simulations(tmp_path: Path) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import re
 import tomllib
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -21,7 +22,7 @@ from acquire.reading import read_regular
 from acquire.text import did_you_mean, shortened, shown
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Sequence
 
     from acquire.config.scene import SceneBase
 
@@ -46,6 +47,10 @@ def find(name: str | Path, beside: Path | None = None, kind: str = "") -> Path:
 
     ``kind``, one of rig, scene and plan, selects the built-in files that an error lists.
     """
+    if not isinstance(name, str | Path):
+        raise ConfigError(
+            f"{shown(name)} cannot be a {kind or 'configuration'} file", possible="a path, or a built-in name"
+        )
     # The user's own files come first, whatever names the built-in ones have.
     candidates = [Path(name)]
     if beside is not None:
@@ -77,7 +82,7 @@ def load_rig(
     path = find(name, kind="rig")
     table = _read(path)
     _check_kind(table, "rig", path)
-    for key, value in (overrides or {}).items():
+    for key, value in _pairs(overrides):
         _set(table, key, value)
     rig = _validate(RigConfig, table, path)
     if (named := rig.calibration) is not None:
@@ -91,6 +96,17 @@ def load_rig(
     scene_path = find(scene, beside=path, kind="scene").resolve()
     simulation = rig.simulation.model_copy(update={"scene": str(scene_path)})
     return rig.model_copy(update={"simulation": simulation})
+
+
+def _pairs(overrides: object) -> list[tuple[str, Any]]:
+    """Return overrides as pairs. Raises ConfigError for anything but texts and their values."""
+    if overrides is None:
+        return []
+    if not (isinstance(overrides, Mapping) and all(isinstance(key, str) for key in overrides)):
+        raise ConfigError(
+            f"{shown(overrides)} cannot override a rig file", possible="{'simulation.speed': 10}, dotted keys"
+        )
+    return list(overrides.items())
 
 
 def check_directory(rig: RigConfig) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from numbers import Real
 from typing import TYPE_CHECKING
 
 from acquire.config.plan import FADE_SUBSTEPS
@@ -11,11 +12,12 @@ from acquire.errors import UsageError
 from acquire.geometry import check_integers
 from acquire.recon.segments import Grid, Stream, Stretch, SubSegment, Voxels, split
 from acquire.reconstruct.times import Times, duration
+from acquire.store import Recording
+from acquire.text import shown
 
 if TYPE_CHECKING:
     from acquire.config.plan import ReconstructionPlan
     from acquire.fibre import Tile
-    from acquire.store import Recording
 
 SPANS_PER_SEGMENT = 4
 """Default length of a sub-segment, in n; a third of its lines is then overlap."""
@@ -98,7 +100,13 @@ def in_tiles(request: VideoRequest, tiles: tuple[Tile, ...]) -> VideoRequest:
 
 
 def stream_of(recording: Recording) -> Stream:
-    """Return the stream of all lines of a recording."""
+    """Return the stream of all lines of a recording. Raises UsageError for anything else."""
+    if not isinstance(recording, Recording):
+        raise UsageError(
+            f"lines of {shown(recording)} cannot be selected",
+            possible="a recording",
+            hint="open_recording(...)",
+        )
     geometry = recording.geometry_for(1)
     first = recording.first_line
     return Stream(geometry.stages, geometry.substeps, first, first + recording.lines)
@@ -120,9 +128,9 @@ def by_time(recording: Recording, begin_ns: int | None, end_ns: int | None) -> S
     """Select the video from ``begin_ns`` to ``end_ns`` after the first read-out, from all lines it needs."""
     times = Times.of(recording)
     for name, ns in (("begin_ns", begin_ns), ("end_ns", end_ns)):
-        if ns is not None and not math.isfinite(ns):
+        if ns is not None and not (isinstance(ns, Real) and math.isfinite(ns)):
             raise UsageError(
-                f"{name} cannot be {ns}", possible="nanoseconds after the first read-out, or None"
+                f"{name} cannot be {ns!r}", possible="nanoseconds after the first read-out, or None"
             )
     begin, end = (None if ns is None else times.substep(ns) for ns in (begin_ns, end_ns))
     return Selection(stream_of(recording), times, begin, end)
@@ -138,6 +146,7 @@ def in_voxels(
     """
     stream = selection.stream
     size = stream.geometry(1).size
+    check_integers(longest=1 if longest is None else longest)
     if longest is not None and longest < 1:
         raise UsageError(
             f"sub-segments of {longest} sub-steps are not possible", possible="1 or more, or None: by default"
@@ -160,6 +169,7 @@ def in_glimpses(selection: Selection, voxels: Voxels, count: int) -> VideoReques
     stream = selection.stream
     stream.geometry(1).check_merge(voxels.spatial_merge, voxels.temporal_merge)
     begin, end = selection.extent(voxels, voxels, whole=False)
+    check_integers(count=count)
     if count < 1:
         raise UsageError(f"{count} glimpses are not possible", possible="1 or more")
     length = (end - begin) // count

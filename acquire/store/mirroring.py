@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Any
 
 from acquire.errors import DataError, StateError, UsageError
 from acquire.lines import ARMS
-from acquire.reading import parse_object, read_regular
+from acquire.reading import parse_object, path_of, read_regular
 from acquire.store import overview
 from acquire.store.array_files import COLUMNS
 from acquire.store.attributes import segment_of
@@ -76,7 +76,7 @@ class Mirrored:
 
 
 def mirror(
-    path: Path,
+    path: Path | str,
     url: str,
     *,
     follow: bool = False,
@@ -90,6 +90,7 @@ def mirror(
     StoreError and PlaceError if the store fails or refuses, and DataError if a recording that is followed
     has not grown for ``idle_s``: its writer is gone.
     """
+    path = path_of(path)
     refuse_link(path, path)
     open_recording(path)  # raises if it is not a recording
     with only_copy(path):

@@ -24,6 +24,7 @@ import numpy as np
 
 from acquire.errors import AcquireError, StateError
 from acquire.lines import ARMS, LineFlag
+from acquire.reading import path_of
 from acquire.store import layout
 from acquire.store.array_files import COLUMNS
 from acquire.store.chunks import AbsentChunkError, DamagedChunkError
@@ -112,7 +113,7 @@ class Recovery:
 
 
 def recover(
-    path: Path,
+    path: Path | str,
     disk: Disk = DISK,
     progress: Callable[[int, int], None] | None = None,
     known: Circumstances = UNKNOWN,
@@ -123,6 +124,7 @@ def recover(
     repeated at any time. Raises PlaceError if there is no recording, DataError if it holds links, StoreError
     if the disk refuses, StateError while it is being written.
     """
+    path = path_of(path)
     refuse_links(path)
     if not root_is_lost(path):
         open_recording(path)  # refuse anything but a recording before it is locked

@@ -6,7 +6,7 @@ import os
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
-from acquire.reading import open_regular, read_regular
+from acquire.reading import open_regular, path_of, read_regular
 from acquire.store.files import tree_bytes
 from acquire.store.remote import RemoteSource, is_url
 
@@ -98,8 +98,8 @@ class LocalSource:
 
 
 def source_of(place: Path | str) -> Source:
-    """Return the source for a path or a URL. Raises UsageError for an invalid URL."""
+    """Return the source for a path or a URL. Raises UsageError for an invalid URL, PlaceError for neither."""
     if not is_url(place):
-        return LocalSource(Path(place))
+        return LocalSource(path_of(place))
     remote = RemoteSource(str(place))
     return remote if remote.path is None else LocalSource(remote.path)
