@@ -31,7 +31,8 @@ def draw_error(file: VideoFile) -> Drawing | None:
     percent = 100 / full_scale * error_of_regions(file, shown)
     if not np.isfinite(percent).any():
         return None
-    frame = np.asarray(file.video[shown[len(shown) // 2]], np.float64)
+    middle = shown[len(shown) // 2]
+    frame = file.frames(middle, middle + 1)[0].astype(np.float64)
     with mpl.rc_context(STYLE | {"axes.grid": False}):
         figure = canvas(HEIGHT_IN)
         left, right = figure.subplots(1, 2)
@@ -49,9 +50,9 @@ def draw_error(file: VideoFile) -> Drawing | None:
 
 def error_of_regions(file: VideoFile, frames: range) -> NDArray[np.float64]:
     """Return the RMS of the error over frames (region_y, region_x); NaN where it is not known."""
-    assert file.error is not None
-    every = max(1, len(frames) // MOST_FRAMES)
-    found = np.asarray(file.error[frames.start : frames.stop : every], np.float64)
+    stored = file.errors(frames.start, frames.stop, max(1, len(frames) // MOST_FRAMES))
+    assert stored is not None
+    found = stored.astype(np.float64)
     known = np.isfinite(found)
     with np.errstate(invalid="ignore", divide="ignore"):
         squares = np.where(known, found, 0) ** 2

@@ -50,7 +50,8 @@ class Panel:
 
     def at(self, time_ns: int) -> NDArray[Any]:
         """Return the frame shown at a time."""
-        frame: NDArray[Any] = np.asarray(self.file.video[self.index(time_ns)])
+        index = self.index(time_ns)
+        frame: NDArray[Any] = self.file.frames(index, index + 1)[0]
         return frame
 
     def index(self, time_ns: int) -> int:
@@ -166,7 +167,7 @@ def _peak(panel: Panel) -> float:
     """Return the value of white for a video: close to its brightest voxel, from a few frames."""
     frames = panel.file.video.shape[0]
     some = np.unique(np.linspace(0, frames - 1, 12).astype(int))
-    values = np.stack([np.asarray(panel.file.video[int(index)]) for index in some])
+    values = np.stack([panel.file.frames(index, index + 1) for index in some.tolist()])
     known = values[np.isfinite(values)]
     # a dark video has no peak to divide by
     return float(np.quantile(known, PEAK_QUANTILE) if known.size else 0) or 1.0

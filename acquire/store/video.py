@@ -34,6 +34,7 @@ from acquire.store.refusals import refused
 from acquire.store.source import source_of
 from acquire.store.video_layout import FORMAT, VideoGrid
 from acquire.store.video_writer import VideoWriter, check_provenance
+from acquire.text import shortened
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -115,11 +116,30 @@ class VideoFile:
         first, end = (min(max(int(edge), 0), len(self.time_ns)) for edge in found)
         return range(first, max(first, end))
 
+    def frames(self, first: int, stop: int, step: int = 1) -> NDArray[Any]:
+        """Read frames (t, y, x), as they are stored. Raises DataError if they are damaged."""
+        return _read(self.video, "frames", slice(first, stop, step))
+
+    def errors(self, first: int, stop: int, step: int = 1) -> NDArray[Any] | None:
+        """Read ``error`` (t, region_y, region_x), if it was written. Raises DataError if it is damaged."""
+        return None if self.error is None else _read(self.error, "errors of frames", slice(first, stop, step))
+
     def _transformed(self, kind: str, default: float) -> tuple[float, float, float]:
         steps = self.attrs["ome"]["multiscales"][0]["datasets"][0]["coordinateTransformations"]
         found = next((step[kind] for step in steps if step["type"] == kind), [default] * 3)
         t, y, x = map(float, found)
         return t, y, x
+
+
+def _read(array: zarr.Array[Any], what: str, some: slice) -> NDArray[Any]:
+    try:
+        return np.asarray(array[some])
+    except DAMAGE as error:
+        raise DataError(
+            f"{what} {some.start} to {some.stop - 1} of {array.store_path} cannot be read: "
+            f"{shortened(error, 200)}",
+            hint="a copy of the video, or acquire reconstruct once more",
+        ) from error
 
 
 def write_video(

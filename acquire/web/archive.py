@@ -19,6 +19,7 @@ from acquire.errors import AcquireError, PlaceError, UsageError
 from acquire.flags import ARMS, NO_IMAGE
 from acquire.store import Recording, format_of, hold, open_recording, open_video, taint_words
 from acquire.store.layout import DAMAGE
+from acquire.store.refusals import refused
 from acquire.store.shortfall import first_shortfall, missing_segments
 from acquire.text import shortened
 from acquire.web.messages import (
@@ -132,13 +133,15 @@ class Archive:
         path = self.path_of(name)
         video = open_video(path)
         # Another video may get the name of one that was removed.
-        key = (name, (path / "zarr.json").stat().st_mtime_ns)
+        with refused(path, "read"):
+            key = (name, (path / "zarr.json").stat().st_mtime_ns)
         if key not in self._ranges:
             # Black and white are the 0.1 % and 99.9 % quantiles of frames over the whole length.
             frames = video.video.shape[0]
             step = max(1, frames // SAMPLED_FRAMES)
-            values = np.stack([np.asarray(video.video[k], np.float32) for k in range(0, frames, step)])
-            black, white = map(float, np.nanquantile(values, (0.001, 0.999)))
+            values = np.stack([video.frames(k, k + 1) for k in range(0, frames, step)]).astype(np.float32)
+            known = values[np.isfinite(values)]  # nothing of a video that was interrupted early
+            black, white = map(float, np.quantile(known, (0.001, 0.999))) if known.size else (0.0, 0.0)
             _remember(self._ranges, key, (black, white if white > black else black + 1.0), MOST_PICTURES)
         low, high = self._ranges[key]
         return _video_facts(name, video).model_copy(update={"low": low, "high": high})
@@ -149,7 +152,7 @@ class Archive:
         most = max(1, MOST_FRAME_BYTES // (facts.rows * facts.columns))
         if not 0 <= first < facts.frames:
             raise UsageError(f"{name} has no frame {first}", possible=f"0 to {facts.frames - 1}")
-        values = np.asarray(video.video[first : first + min(count, most)], np.float32)
+        values = video.frames(first, first + min(count, most)).astype(np.float32)
         # Voxels of tiles that were not written are NaN, and shown black.
         scaled = np.nan_to_num((values - facts.low) * (255 / max(facts.high - facts.low, 1e-12)))
         content: bytes = np.clip(scaled, 0, 255).astype(np.uint8).tobytes()

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import os
+
 import av
 import numpy as np
 import pytest
 from PIL import Image
 
-from acquire.errors import UsageError
+from acquire.errors import DataError, UsageError
 from acquire.evaluate.rendering import Look, Panel, common_times, render
 from acquire.store import open_video, write_video
 
@@ -81,3 +83,13 @@ def test_impossible_renderings_are_refused(tmp_path):
         render([one], tmp_path / "m.avi", Look(), 5)
     with pytest.raises(UsageError, match="no time in common"):
         render([one, panel(tmp_path, "b", 5, 1000, begin=10**9)], tmp_path / "m.gif", Look(), 5)
+
+
+def test_a_damaged_video_is_told(tmp_path):
+    found = panel(tmp_path, "a", 6, 1000)
+    for file in (tmp_path / "a.zarr" / "0" / "c").rglob("*"):
+        if file.is_file():
+            os.truncate(file, file.stat().st_size // 2)
+    with pytest.raises(DataError, match=r"frames 0 to 0 of .*a\.zarr.* cannot be read: .*; try: a copy"):
+        render([found], tmp_path / "s.png", Look(panel_px=48), 4)
+    assert not (tmp_path / "s.png").exists()

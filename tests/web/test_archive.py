@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import os
 import shutil
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 from acquire.clock import ClockFit
 from acquire.codes import PrbsCode
+from acquire.errors import DataError, PlaceError
 from acquire.lines import ARMS, LineBlock, LineFlag
 from acquire.store import RecordingSpec, RecordingWriter, RunCondition, open_recording, write_video
 from acquire.stream.tagger import Tagger
@@ -53,3 +56,31 @@ def test_a_new_video_under_an_old_name_has_a_range_of_its_own(tmp_path: Path) ->
         ranges.append(archive.video(path.name).high)
         shutil.rmtree(path)
     assert ranges[1] > 7 * (ranges[0] or 0.0) > 6
+
+
+def test_a_damaged_video_is_told_as_damaged(tmp_path: Path) -> None:
+    """It was called a defect in the daemon."""
+    path, frames = tmp_path / "film.zarr", np.random.default_rng(1).random((4, 6, 6), np.float32)
+    write_video(path, frames, np.arange(4), pixel_size=1.0, frame_interval_ns=1.0, provenance={})
+    seen = Archive(tmp_path)
+    seen.video(path.name)  # its range is known from here on
+    for file in (path / "0" / "c").rglob("*"):
+        if file.is_file():
+            os.truncate(file, file.stat().st_size // 2)
+    for archive in (seen, Archive(tmp_path)):
+        with pytest.raises(
+            DataError, match=r"frames 0 to [03] of .*film.zarr.* cannot be read: .*; try: a copy"
+        ):
+            archive.frames(path.name, 0, 4)
+    (path / "zarr.json").unlink()
+    with pytest.raises(PlaceError):
+        seen.video(path.name)
+
+
+def test_a_video_of_which_nothing_was_written_is_black(tmp_path: Path) -> None:
+    """One that was interrupted early; its range was that of no number, which no answer can hold."""
+    path, frames = tmp_path / "film.zarr", np.full((4, 6, 6), np.nan, np.float32)
+    write_video(path, frames, np.arange(4), pixel_size=1.0, frame_interval_ns=1.0, provenance={})
+    found = Archive(tmp_path).video(path.name)
+    assert (found.low, found.high) == (0.0, 1.0)
+    assert Archive(tmp_path).frames(path.name, 0, 4) == bytes(frames.size)
