@@ -68,24 +68,32 @@ def search(directory: Path, recorded: Collection[Path] = ()) -> Found:
     paths = sorted(path for path in directory.iterdir() if path.name.endswith(".zarr"))
     known, found = set(recorded), Found([], [])
     for path in dict.fromkeys([*paths, *recorded]):
-        noted = path in known  # by an earlier daemon, whatever its name
         try:
-            attributes = read_root(LocalSource(path))["attributes"]
-        except AcquireError as error:
-            if path.is_dir() and (noted or (root_is_lost(path) and known_attributes(path) is not None)):
-                found.open.append(path)  # its root may be rebuilt
-            elif noted and not os.path.lexists(path):
-                text = (
-                    "it was being recorded when an earlier daemon ended, and is not there: "
-                    "is its disk mounted?"
-                )
-                found.odd.append(RecoveryStatus(path=path, state="gone", text=text))
-            else:
-                found.odd.append(RecoveryStatus(path=path, state="left", text=error.message))
-            continue
-        if attributes.get("format") in READABLE and attributes.get("state") == "recording":
-            found.open.append(path)
+            _look_at(path, found, noted=path in known)  # by an earlier daemon, whatever its name
+        except OSError as error:
+            # One that may not be entered, or whose disk does not answer, hides none of the others.
+            text = f"it cannot be looked at: {error.strerror}"
+            found.odd.append(RecoveryStatus(path=path, state="left", text=text))
     return found
+
+
+def _look_at(path: Path, found: Found, *, noted: bool) -> None:
+    """Add a path to ``found``, unless it is a recording that is sealed. Raises OSError."""
+    try:
+        attributes = read_root(LocalSource(path))["attributes"]
+    except AcquireError as error:
+        if path.is_dir() and (noted or (root_is_lost(path) and known_attributes(path) is not None)):
+            found.open.append(path)  # its root may be rebuilt
+        elif noted and not os.path.lexists(path):
+            text = (
+                "it was being recorded when an earlier daemon ended, and is not there: is its disk mounted?"
+            )
+            found.odd.append(RecoveryStatus(path=path, state="gone", text=text))
+        else:
+            found.odd.append(RecoveryStatus(path=path, state="left", text=error.message))
+        return
+    if attributes.get("format") in READABLE and attributes.get("state") == "recording":
+        found.open.append(path)
 
 
 def salvage(mailbox: Mailbox, task: Task) -> None:

@@ -205,6 +205,22 @@ def test_odd_entries_are_named_once_and_gone_around(
     assert [one.model_dump_json() for one in salvage.recoveries]
 
 
+def test_a_noted_recording_that_cannot_be_looked_at_hides_no_other(tmp_path: Path) -> None:
+    """On a disk that does not answer, or in a directory that this user may not enter any more."""
+    good, journal = leave_open(tmp_path / "good.zarr"), tmp_path / "journal"
+    unreachable = tmp_path / ("x" * 300)  # as good as one: what stands there cannot be found out
+    Journal(journal, "not_sealed", "").write([unreachable])
+    salvage = Salvage(tmp_path, journal)
+    try:
+        salvage.search()
+        look_until(salvage, lambda: states(salvage).get("good.zarr") == "recovered")
+        assert states(salvage)[unreachable.name] == "left"
+        assert open_recording(good).state == "sealed"
+        assert Journal(journal, "not_sealed", "").read() == [unreachable]
+    finally:
+        salvage.close()
+
+
 def test_open_recordings_with_odd_attributes_are_named(salvage: Salvage, tmp_path: Path) -> None:
     changes: dict[str, object] = {"config": None, "host": ["x"]}
     for key, value in changes.items():
