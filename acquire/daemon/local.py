@@ -7,8 +7,8 @@ status that this thread has published, so that it never waits for a device.
 from __future__ import annotations
 
 import asyncio
+import time
 from collections.abc import Awaitable, Callable
-from datetime import UTC, datetime
 from typing import TYPE_CHECKING
 
 from acquire.daemon.health import health_of
@@ -86,8 +86,7 @@ class Local:
 
     async def health(self) -> Health:
         status, config = self._service.status(), self._service.config
-        age_s = (datetime.now(UTC) - self._service.armed_since).total_seconds()
-        return health_of(status, config.passing_hz, age_s)
+        return health_of(status, config.passing_hz, time.monotonic() - self._service.armed_s)
 
     async def version(self) -> Version:
         return version_of(self._service.config)

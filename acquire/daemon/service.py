@@ -65,7 +65,7 @@ class Service:
         self.origin = ""
         """The file that the configuration was read from."""
         self.news = NewsLog()
-        self.armed_since = datetime.now(UTC)
+        self.armed_s = time.monotonic()
         self._open_run = open_run
         self._prove = prove
         self._salvage = salvage or Salvage(config.recording.directory.absolute())
@@ -134,7 +134,7 @@ class Service:
             run.arm(self._show)
             # Only now: a run that could not be armed has undone everything itself.
             self._run, self._seen, self._rates = run, CaptureStatus(), Rates()
-            self.armed_since = datetime.now(UTC)
+            self.armed_s = time.monotonic()  # not by the clock, which may be set
             self._order = StandingOrder(self.config)
             self._go(Event.ARM, run.run_id)
             if run.calibration is not None and not run.calibration.carried:

@@ -9,8 +9,9 @@ import json
 import socket
 import threading
 import time
-from datetime import UTC, datetime
+from datetime import UTC, datetime, timedelta, tzinfo
 from pathlib import Path
+from typing import Self
 
 import httpx
 import pytest
@@ -322,6 +323,24 @@ def test_healthz_says_503_for_a_fault(path: Path, daemon: Client, run: FakeRun, 
         answer = raw.get("/healthz")
     assert answer.status_code == 503
     assert "no light" in answer.json()["message"]
+
+
+def test_a_clock_that_is_set_back_hides_no_slow_lines(
+    daemon: Client, service: Service, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Rates are judged some seconds after arming, which was an hour in the future."""
+    monkeypatch.setattr("acquire.daemon.health.SETTLED_S", 0.0)
+
+    class Ahead(datetime):
+        @classmethod
+        def now(cls, tz: tzinfo | None = None) -> Self:
+            return super().now(tz) + timedelta(hours=1)
+
+    with monkeypatch.context() as clock:
+        clock.setattr("acquire.daemon.service.datetime", Ahead)
+        daemon.arm()
+    names = {check.name for check in daemon.health().checks}
+    assert {"rate a", "rate b"} <= names
 
 
 def test_setup_says_what_is_not_the_default(daemon: Client, service: Service) -> None:
