@@ -32,7 +32,7 @@ from acquire.store import RunCondition
 from acquire.stream import Begin, CaptureStatus, Note
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Callable, Iterator
 
     from acquire.config import RigConfig
     from acquire.daemon.messages import CapacityStatus, RecoveryStatus, StartRequest
@@ -214,18 +214,19 @@ class Service:
 
         Everything else, even a defect there, must not keep the capture path from being supervised.
         """
-        try:
-            self._recovered(self._salvage.poll(capturing=self._run is not None))
-        except Exception as error:  # noqa: BLE001 - shown in the status; the capture comes first
-            self.troubles.note("recoveries", error)
-        try:
-            self._uploads.poll()
-            published = self._status.uploads, self._status.upload_warning
-            if (self._uploads.statuses, self._uploads.warning) != published:
-                self._publish()
-        except Exception as error:  # noqa: BLE001 - as above
-            self.troubles.note("uploads", error)
-        self._disk.check(recording=self._state is State.RECORDING)
+        beside: tuple[tuple[str, Callable[[], object]], ...] = (
+            ("recoveries", lambda: self._recovered(self._salvage.poll(capturing=self._run is not None))),
+            ("uploads", self._uploads.poll),
+            ("disk", lambda: self._disk.check(recording=self._state is State.RECORDING)),
+        )
+        for what, work in beside:
+            try:
+                work()
+            except Exception as error:  # noqa: BLE001 - shown in the status; the capture comes first
+                self.troubles.note(what, error)
+        published = self._status.uploads, self._status.upload_warning
+        if (self._uploads.statuses, self._uploads.warning) != published:
+            self._publish()
         # While idle nothing is published, but the disk fills, and there may be troubles.
         self.news.update(self.status())
         if self._run is None:
@@ -432,10 +433,7 @@ class Service:
 
     @contextlib.contextmanager
     def _doing(self, command: Event) -> Iterator[None]:
-        """Refuse a command that the state does not allow, before any change; else mark it busy.
-
-        Raises the fault if the command ends in one.
-        """
+        """Refuse a command that the state does not allow, or mark it busy. Raises a fault that it ends in."""
         after(self._state, command)
         self._busy = command
         self._publish()

@@ -407,15 +407,16 @@ def test_a_defect_beside_the_capture_does_not_keep_it_from_being_watched(
     bed.record()
 
     def broken(*_: object, **__: object) -> None:
-        raise RecursionError("a nested journal")
+        raise RuntimeError("can't start new thread")
 
     monkeypatch.setattr(bed.service._salvage, "poll", broken)
     monkeypatch.setattr(bed.service._uploads, "poll", broken)
+    monkeypatch.setattr(bed.service._disk, "check", broken)
     bed.run.see(fault="camera a is gone")
     bed.service.supervise()
     status = bed.service.status()
     assert (status.state, status.fault) == (State.FAULTED, "camera a is gone")
-    assert {one.text.partition(":")[0] for one in status.troubles} == {"recoveries", "uploads"}
+    assert {one.text.partition(":")[0] for one in status.troubles} == {"recoveries", "uploads", "disk"}
 
 
 def test_a_defect_in_watching_is_a_fault(bed: Bed) -> None:
