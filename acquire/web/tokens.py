@@ -60,19 +60,37 @@ class Tokens:
 
 def load_tokens(path: Path) -> Tokens:
     """Read the tokens from ``path``, or create it. Raises UsageError if others may read it."""
-    # Only the owner can ever read the file, and O_EXCL neither overwrites an existing one nor follows a link.
     try:
-        file = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o600)
-    except FileExistsError:
-        return _read_tokens(path)
+        if not os.path.lexists(path):
+            _create(path)
     except OSError as error:
         raise UsageError(
-            f"the token file {path} cannot be opened: {error.strerror}", hint="web.token_file"
+            f"the token file {path} cannot be created: {error.strerror}", hint="web.token_file"
         ) from error
-    created = {role: secrets.token_urlsafe(_TOKEN_BYTES) for role in ROLES}
-    with os.fdopen(file, "w") as out:
-        json.dump(created, out)
-    return Tokens(**created)
+    # Read in any case: another process may have been faster.
+    return _read_tokens(path)
+
+
+def _create(path: Path) -> None:
+    """Create the file as a whole, unless there is one by then. Raises OSError."""
+    text = json.dumps({role: secrets.token_urlsafe(_TOKEN_BYTES) for role in ROLES}).encode()
+    # Under another name first: a full disk, or a kill, would leave a file that is not valid, and who reads it
+    # in between would find one. Only the owner can ever read it.
+    scratch = path.with_name(f".{path.name}.{secrets.token_hex(4)}")
+    try:
+        file = os.open(scratch, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o600)
+        with os.fdopen(file, "wb") as out:
+            out.write(text)
+            out.flush()
+            os.fsync(out.fileno())
+        try:
+            os.link(scratch, path)  # neither overwrites an existing one nor follows a link
+        except FileExistsError:
+            return
+        except OSError:  # a file system without hard links
+            scratch.rename(path)
+    finally:
+        scratch.unlink(missing_ok=True)
 
 
 def _read_tokens(path: Path) -> Tokens:

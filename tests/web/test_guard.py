@@ -5,6 +5,9 @@ from __future__ import annotations
 import asyncio
 import json
 import stat
+import subprocess
+import sys
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -115,6 +118,34 @@ def test_tokens_are_made_once_for_their_owner_alone(tmp_path: Path) -> None:
     assert made.role_of_token(made.viewer) == "viewer"
     assert made.role_of_token("") is None
     assert made.role_of_cookie(made.cookie("operator")) == "operator"
+
+
+FULL = """
+import resource, sys
+from pathlib import Path
+from acquire.web.tokens import load_tokens
+resource.setrlimit(resource.RLIMIT_FSIZE, (0, 0))
+load_tokens(Path(sys.argv[1]))
+"""
+
+
+def test_a_full_disk_leaves_no_token_file(tmp_path: Path) -> None:
+    """An empty one was refused ever after, also once there was room."""
+    path = tmp_path / "tokens"
+    done = subprocess.run(
+        [sys.executable, "-c", FULL, str(path)], capture_output=True, check=False, text=True, timeout=300
+    )
+    assert "UsageError: the token file" in done.stderr
+    assert not list(tmp_path.iterdir())
+    load_tokens(path)
+
+
+def test_whoever_asks_first_at_the_same_time_gets_the_same_tokens(tmp_path: Path) -> None:
+    for number in range(20):
+        with ThreadPoolExecutor(4) as threads:
+            found = list(threads.map(load_tokens, [tmp_path / f"tokens-{number}"] * 4))
+        assert len({tokens.operator for tokens in found}) == 1
+    assert len(list(tmp_path.iterdir())) == 20
 
 
 @pytest.mark.parametrize("content", ["", "{}", "[]", json.dumps({"operator": "x", "viewer": "y"}), "\0"])
