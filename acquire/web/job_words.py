@@ -37,13 +37,16 @@ def free_name(directory: Path, request: JobRequest) -> str:
 
 def recording_words(request: JobRequest, name: str) -> list[str]:
     """Return the arguments of the command that makes ``name`` from a recording."""
+    # last, and after "--": its name may begin as an option does
+    recording = ["--", request.recording]
     lines = ["--first-line", str(request.first_line), "--lines", str(request.lines), "--out", name, "--json"]
     if request.kind == "cut":
-        return ["cut", request.recording, *lines]
+        return ["cut", *lines, *recording]
     if request.kind == "preview":
-        return ["reconstruct", request.recording, *lines, "--preview", "--workers", "1"]
+        return ["reconstruct", *lines, "--preview", "--workers", "1", *recording]
     voxels = ["--spatial-merge", str(request.spatial_merge), "--temporal-merge", str(request.temporal_merge)]
-    return ["reconstruct", request.recording, *lines, *voxels, "--preset", request.preset, "--workers", "1"]
+    preset = ["--preset", request.preset, "--workers", "1"]
+    return ["reconstruct", *lines, *voxels, *preset, *recording]
 
 
 def calibration_words(request: CalibrationRequest, out: Path) -> list[str]:

@@ -17,10 +17,13 @@ from page_server import PageServer
 from served import api
 from store_helpers import fill, make_spec
 
+from acquire.config import load_rig, load_scene
 from acquire.daemon.endpoint import Endpoint
 from acquire.daemon.service import Service
+from acquire.simulate import simulate
 from acquire.store import RecordingWriter, RunCondition
 from acquire.web import glimpser, jobs, worker
+from acquire.web.job_words import free_name, recording_words
 from acquire.web.messages import JobFacts, JobRequest
 
 LONG = """
@@ -85,6 +88,18 @@ def test_glimpses_come_once_a_process_can_be_started_again(monkeypatch: pytest.M
         return owner.number
 
     assert asyncio.run(watch()) >= 1
+
+
+@pytest.mark.parametrize("kind", ["cut", "preview"])
+def test_a_recording_whose_name_begins_like_an_option(tmp_path: Path, kind: str) -> None:
+    rig, scene = load_rig("rig-demo", {"geometry.stages": 8}), load_scene("scene-leds")
+    simulate(rig, scene, tmp_path / "-r.zarr", 60)
+    request = JobRequest.model_validate({"kind": kind, "recording": "-r.zarr", "first_line": 0, "lines": 40})
+    name = free_name(tmp_path, request)
+    words = [sys.executable, "-m", "acquire", *recording_words(request, name)]
+    done = subprocess.run(words, cwd=tmp_path, capture_output=True, check=False, text=True, timeout=300)
+    assert done.returncode == 0, done.stderr
+    assert (tmp_path / name).exists()
 
 
 def test_a_request_that_is_repeated_is_carried_out_once(tmp_path: Path) -> None:
