@@ -93,7 +93,7 @@ def _call(name: str, words: list[str], text: bytes, limit_s: float, *, posts: bo
             # Ctrl-C on the daemon's terminal is not meant for it; and it is given up with its children
             start_new_session=True,
         )
-    except OSError as error:
+    except (OSError, ValueError) as error:  # a zero byte in a word is a ValueError
         log.warning("hook %s: %s", name, error)
         return
     try:

@@ -61,11 +61,11 @@ def test_a_hook_that_hangs_or_fails_is_given_up(tmp_path: Path, caplog: pytest.L
     log = NewsLog()
     hooks = [
         Hooks(HooksConfig(command=words, timeout_s=0.2), log, "rig")
-        for words in (("sleep", "300"), ("false",), (str(tmp_path / "none"),))
+        for words in (("sleep", "300"), ("false",), (str(tmp_path / "none"),), ("a\0b",))
     ]
     log.add("loss", "x", level="error")
     deadline = time.monotonic() + 300
-    while not all(word in caplog.text for word in ("timed out", "exit code 1", "No such file")):
+    while not all(word in caplog.text for word in ("timed out", "exit code 1", "No such file", "null byte")):
         assert time.monotonic() < deadline
         time.sleep(0.02)
     for one in hooks:
