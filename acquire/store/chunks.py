@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 from acquire.store.array_files import ArrayFiles
 from acquire.store.codecs import BLOSC_HEADER, check_size, crc32c, decode, stored_size
+from acquire.store.refusals import shows_damage
 from acquire.store.shape import ABSENT, CRC_BYTES, index_bytes
 
 if TYPE_CHECKING:
@@ -81,21 +82,31 @@ class ChunkReader(ArrayFiles):
         return payload
 
     def size_at(self, number: int, offset: int) -> int:
-        """Return the size that a chunk at ``offset`` has by its own header; 0 if there cannot be one."""
+        """Return the size that a chunk at ``offset`` has by its own header; 0 if there cannot be one.
+
+        Raises OSError if that cannot be found out now.
+        """
         try:
             header = self._source.read_range(self.file(number), offset, BLOSC_HEADER)
-        except OSError:
+        except OSError as error:
+            if not shows_damage(error):
+                raise
             return 0
         return stored_size(header, self.shape.chunk_bytes, self.shape.codec)
 
     def trouble(self, number: int) -> str | None:
-        """Return what is wrong with a chunk, in words; None if it has the right length and checksum."""
+        """Return what is wrong with a chunk, in words; None if it has the right length and checksum.
+
+        Raises OSError if that cannot be found out now.
+        """
         try:
             # Not unpacked: the checksum is of the packed bytes.
             self.payload(number, *self.entry(number))
         except (AbsentChunkError, DamagedChunkError) as error:
             return str(error)
         except OSError as error:
+            if not shows_damage(error):
+                raise
             return f"it cannot be read: {error.strerror or error}"
         return None
 

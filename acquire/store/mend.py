@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 from acquire.store.chunks import DamagedChunkError
 from acquire.store.codecs import crc32c, encode
 from acquire.store.pages import PAGE, page_up
+from acquire.store.refusals import shows_damage
 from acquire.store.shape import ABSENT, pack_index
 
 if TYPE_CHECKING:
@@ -71,11 +72,18 @@ def rewrite_chunk(disk: Disk, path: Path, reader: ChunkReader, chunk: int, rows:
 
 
 def _holds(reader: ChunkReader, chunk: int, offset: int, size: int) -> bool:
-    """Return whether there is an intact chunk at this place; impossible entries are not read."""
+    """Return whether there is an intact chunk at this place; impossible entries are not read.
+
+    Raises OSError if that cannot be found out now.
+    """
     if not 0 < size <= reader.most_bytes or offset % PAGE or offset < PAGE:
         return False
     try:
         reader.payload(chunk, offset, size)
-    except (DamagedChunkError, OSError):
+    except DamagedChunkError:
+        return False
+    except OSError as error:
+        if not shows_damage(error):
+            raise
         return False
     return True

@@ -14,6 +14,7 @@ from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
 from acquire.errors import DataError, PlaceError, StoreError
+from acquire.reading import OddFileError
 from acquire.store.remote import is_url
 
 if TYPE_CHECKING:
@@ -35,8 +36,32 @@ NOT_A_PLACE = (
 )
 """Errors of a path, or of this user's permissions there; all other errors are the disk's."""
 
+_DAMAGE = (
+    errno.EBADMSG,
+    errno.EILSEQ,
+    errno.EIO,
+    errno.EISDIR,
+    errno.ELOOP,
+    errno.ENODATA,
+    errno.ENOENT,
+    errno.ENOTDIR,
+    errno.ENXIO,
+    errno.EREMOTEIO,
+    errno.EUCLEAN,
+)
+
 _RIGHTS = "the credentials in the environment (for S3: AWS_ACCESS_KEY_ID, AWS_SECRET_ACCESS_KEY, AWS_REGION)"
+_LOCAL = ("file://", "local://")
 _NETWORK = "the network and the store's address (for S3: AWS_ENDPOINT, and AWS_ALLOW_HTTP=true for http://)"
+
+
+def shows_damage(error: OSError) -> bool:
+    """Return whether an error of reading shows that a file, or its medium, is damaged or gone.
+
+    Any other may pass, such as no descriptor or memory left, no permission, a network that is away. It says
+    nothing about the lines, which must not be flagged as missing for it.
+    """
+    return isinstance(error, FileNotFoundError | OddFileError) or error.errno in _DAMAGE
 
 
 @contextmanager
@@ -54,7 +79,7 @@ def refusal(place: object, error: OSError, doing: str, hint: str = "") -> Acquir
     ``hint`` is added to the advice.
     """
     text = f"{place} cannot be {doing}: {error.strerror or error}"
-    if is_url(str(place)):
+    if is_url(str(place)) and not str(place).startswith(_LOCAL):
         kind: type[AcquireError] = StoreError
         advice = _NETWORK
         if isinstance(error, FileNotFoundError):

@@ -53,10 +53,7 @@ def remove(disk: Disk, path: Path, proof: Unborn | Dropped) -> None:
             if committed_lines:
                 raise DataError(f"{path} is not removed: {committed_lines} lines of it were committed")
             refuse_links(path)
-            for directory, _, names in os.walk(path):
-                if odd := sorted(set(names) - _MADE_FIRST):
-                    held = f"{os.path.relpath(directory, path)}/{odd[0]}"
-                    raise DataError(f"{path} is not removed: it holds {held}")
+            _refuse_lines(path)
             disk.remove_tree(path)
         case Dropped(shard, listed):
             if not any(shard in shards for shards in listed):
@@ -69,6 +66,19 @@ def remove(disk: Disk, path: Path, proof: Unborn | Dropped) -> None:
                 disk.remove(file)
             for arm in ARMS:
                 disk.remove_directory(path / arm / "lines" / "c" / str(shard))
+
+
+def _refuse_lines(path: Path) -> None:
+    """Raise DataError if a directory holds, or may hold, what came after a recording's preparation."""
+
+    def unknown(error: OSError) -> None:
+        raise DataError(f"{path} is not removed: what it holds cannot be listed: {error.strerror}")
+
+    # Without `unknown`, a directory that cannot be listed now would count as an empty one.
+    for directory, _, names in os.walk(path, onerror=unknown):
+        if odd := sorted(set(names) - _MADE_FIRST):
+            held = f"{os.path.relpath(directory, path)}/{odd[0]}"
+            raise DataError(f"{path} is not removed: it holds {held}")
 
 
 def shard_files(path: Path, shard: int) -> list[Path]:

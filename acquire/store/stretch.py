@@ -16,6 +16,7 @@ import numpy as np
 
 from acquire.errors import DataError
 from acquire.store.chunks import AbsentChunkError, DamagedChunkError
+from acquire.store.refusals import refusal, shows_damage
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -49,7 +50,7 @@ class Stretch:
     def read(self, out: NDArray[Any] | None = None, columns: slice | None = None) -> NDArray[Any]:
         """Return the rows, in ``out`` if given, and only their ``columns`` if given.
 
-        Raises DataError if they are not intact on disk.
+        Raises DataError if they are not intact on disk, StoreError or PlaceError if that cannot be found out.
         """
         shape = self._reader.shape
         rows = np.empty((self._stop - self._start, *shape.row_shape), shape.dtype) if out is None else out
@@ -69,9 +70,16 @@ class Stretch:
                 f"{self._reader}: line {self._first_line + absent} is recorded, but not on disk",
                 hint="`acquire verify` lists the lines that are left; a file was lost or cut short",
             ) from error
-        except (DamagedChunkError, OSError) as error:
-            first, last = self._first_line + self._start, self._first_line + self._stop - 1
-            raise DataError(
-                f"{self._reader}: lines {first} to {last} cannot be read: {error}",
-                hint="`acquire verify` lists the intact lines, `acquire recover` masks the others",
-            ) from error
+        except OSError as error:
+            if not shows_damage(error):
+                raise refusal(self._reader, error, "read") from error
+            raise self._damaged(error) from error
+        except DamagedChunkError as error:
+            raise self._damaged(error) from error
+
+    def _damaged(self, error: Exception) -> DataError:
+        first, last = self._first_line + self._start, self._first_line + self._stop - 1
+        return DataError(
+            f"{self._reader}: lines {first} to {last} cannot be read: {error}",
+            hint="`acquire verify` lists the intact lines, `acquire recover` masks the others",
+        )

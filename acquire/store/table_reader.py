@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from acquire.errors import DataError
 from acquire.store.layout import PARSE_ERRORS
+from acquire.store.refusals import refusal, shows_damage
 from acquire.store.shape import CRC_BYTES, small_crc32c
 
 if TYPE_CHECKING:
@@ -79,8 +80,15 @@ class _Table:
                 return _texts(data, rows)
             # With struct, since listing recordings should not wait for numpy to load.
             return list(struct.unpack_from(f"<{rows}{NUMBERS[data_type]}", data))
-        except (*PARSE_ERRORS, struct.error, OSError) as error:
-            raise DataError(f"{self.source}: table {self.name}/{column} cannot be read: {error!r}") from error
+        except OSError as error:
+            if not shows_damage(error):
+                raise refusal(f"{self.source}/{self.name}/{column}", error, "read") from error
+            raise self._damaged(column, error) from error
+        except (*PARSE_ERRORS, struct.error) as error:
+            raise self._damaged(column, error) from error
+
+    def _damaged(self, column: str, error: Exception) -> DataError:
+        return DataError(f"{self.source}: table {self.name}/{column} cannot be read: {error!r}")
 
     def numbers(self, column: str) -> list[int]:
         return self.cells(column)
@@ -94,7 +102,7 @@ class _Table:
             by_value = dict(zip(attributes["flag_values"], meanings, strict=True))
             return [by_value[value] for value in values]
         except PARSE_ERRORS as error:
-            raise DataError(f"{self.source}: table {self.name}/{column} cannot be read: {error!r}") from error
+            raise self._damaged(column, error) from error
 
 
 def _texts(data: bytes, rows: int) -> list[str]:

@@ -15,6 +15,7 @@ from acquire.store import overview
 from acquire.store.layout import DAMAGE
 from acquire.store.links import refuse_links
 from acquire.store.reader import open_source
+from acquire.store.refusals import refused
 from acquire.store.scan import chunks_of, missing_rows, scan
 from acquire.store.shortfall import Damage, missing_segments
 from acquire.store.source import LocalSource, source_of
@@ -26,6 +27,7 @@ if TYPE_CHECKING:
 
     from acquire.store.reader import Recording
     from acquire.store.scan import ArmScan
+    from acquire.store.source import Source
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,12 +73,19 @@ def verify(place: Path | str, progress: Callable[[int, int], None] | None = None
 
     Checks are presence, length and checksum of every chunk, that numbering, gaps, flags and ledger agree, and
     that listed segments exist. Raises as `open_recording` does, and DataError for a recording that holds
-    links.
+    links. What cannot be read now, for want of permission, memory or a network, is no damage: PlaceError or
+    StoreError.
     """
     source = source_of(place)
     if isinstance(source, LocalSource):
         refuse_links(source.path)
-    recording = open_source(source)
+    with refused(source, "read"):
+        return _verified(open_source(source), source, progress)
+
+
+def _verified(
+    recording: Recording, source: Source, progress: Callable[[int, int], None] | None
+) -> Verification:
     scans = scan(recording, recording.kept_rows(), progress)
     gone = open_source(source).dropped  # lines that retention deleted during the scan are not damaged
     damage = tuple(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import random
 import subprocess
@@ -30,6 +31,7 @@ from acquire.store import (
     verify,
 )
 from acquire.store.mirroring import Mirror, only_copy
+from acquire.store.refusals import refusal
 from acquire.store.remote import PATIENCE, PROOF, RemoteSource, be_patient
 
 SPEC = make_spec()
@@ -391,3 +393,9 @@ def test_errors_of_other_file_systems_are_told_with_the_address(tmp_path, monkey
     monkeypatch.setattr(fsspec.get_filesystem_class("memory"), "cat_file", refuse)
     with pytest.raises(PlaceError, match=r"^memory://x.zarr cannot be read: Forbidden; try: the credentials"):
         open_recording("memory://x.zarr")
+
+
+def test_a_directory_of_this_machine_needs_no_credentials(tmp_path):
+    found = refusal(f"file://{tmp_path}", PermissionError(errno.EACCES, "Permission denied"), "written")
+    assert "credentials" not in found.hint
+    assert "permissions" in found.hint

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 import re
@@ -59,6 +60,24 @@ def test_a_directory_that_holds_no_line_is_removed_by_the_same_proof(path):
         remove(DISK, path, Unborn(5))
     remove(DISK, path, Unborn(0))
     assert not path.exists()
+
+
+def test_what_cannot_be_listed_now_is_not_removed(path, monkeypatch):
+    """No descriptor is left: it counted as an empty directory."""
+    leave_open(path)
+    before, really = snapshot(path), os.scandir
+
+    def fails(place="."):
+        if Path(place).name in ARMS:
+            raise OSError(errno.EMFILE, os.strerror(errno.EMFILE))
+        return really(place)
+
+    with monkeypatch.context() as trouble:
+        trouble.setattr(os, "scandir", fails)
+        trouble.setattr("acquire.store.removal.refuse_links", lambda _: None)  # it had a descriptor
+        with pytest.raises(DataError, match="what it holds cannot be listed: Too many open files"):
+            remove(DISK, path, Unborn(0))
+    assert snapshot(path) == before
 
 
 def test_trees_are_deleted_in_one_place_only():

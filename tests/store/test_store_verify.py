@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import json
+import os
 from dataclasses import replace
 
 import numpy as np
@@ -11,12 +12,14 @@ import pytest
 import zarr
 from store_helpers import Truth, check_rows, fill, make_spec
 
-from acquire.errors import PlaceError, StateError
+from acquire.errors import DataError, PlaceError, StateError, StoreError
 from acquire.lines import ARMS, LineFlag
 from acquire.store import Circumstances, Gap, RecordingWriter, RunCondition, open_recording, recover, verify
 from acquire.store.host import has_run_on, is_here
 from acquire.store.pages import PAGE
 from acquire.store.removal import COPY
+from acquire.store.shape import index_bytes
+from acquire.store.source import LocalSource
 from acquire.store.table import EVENT_ROWS
 
 SPEC = make_spec(codec="none")
@@ -299,3 +302,66 @@ def test_a_recording_says_which_machine_wrote_it(path):
     assert not has_run_on(elsewhere)
     assert not has_run_on({"host": {**attributes["host"], "boot_id": "before"}})
     assert not is_here({})
+
+
+@pytest.mark.parametrize("number", [errno.EMFILE, errno.ENOMEM, errno.EACCES, errno.ETIMEDOUT])
+@pytest.mark.parametrize("torn", [False, True])
+def test_what_cannot_be_read_now_is_neither_damaged_nor_masked(path, monkeypatch, number, torn):
+    """No descriptor is left, or a share does not answer: the lines are there, and a recovery is repeated."""
+    with RecordingWriter.create(path, SPEC) as writer:
+        fill(writer, 230)
+        writer.commit()
+    if torn:  # the checksum of the index, so that each chunk is looked at
+        file = path / "b" / "lines" / "c" / "1" / "0"
+        data = bytearray(file.read_bytes())
+        data[index_bytes(4) - 1] ^= 1
+        file.write_bytes(data)
+    really, before = LocalSource.read_range, (path / "zarr.json").read_bytes()
+
+    def fails(self, key, start, size):
+        if key == "b/lines/c/1/0" and start:
+            raise OSError(number, os.strerror(number))
+        return really(self, key, start, size)
+
+    kind = PlaceError if number == errno.EACCES else StoreError
+    with monkeypatch.context() as trouble:
+        trouble.setattr(LocalSource, "read_range", fails)
+        for attempt in (lambda: recover(path), *([] if torn else [lambda: verify(path)])):
+            with pytest.raises(kind, match=os.strerror(number)):
+                attempt()
+        if not torn:
+            with pytest.raises(kind, match="b/lines cannot be read"):
+                open_recording(path).cut(1064, 5)
+    assert (path / "zarr.json").read_bytes() == before
+    assert recover(path).damage == ()
+    check_rows(zarr.open_group(path, mode="r"), SPEC, 224)
+
+
+def test_tables_that_cannot_be_read_now_are_not_damaged(path, monkeypatch):
+    write(path, lost=range(20, 30))
+    recording, really = open_recording(path), LocalSource.read
+
+    def fails(self, key):
+        if key.startswith("gaps/"):
+            raise OSError(errno.EMFILE, os.strerror(errno.EMFILE))
+        return really(self, key)
+
+    monkeypatch.setattr(LocalSource, "read", fails)
+    for attempt in (lambda: recording.gaps, lambda: verify(path)):
+        with pytest.raises(StoreError, match=r"gaps/.* cannot be read: Too many open files"):
+            attempt()
+
+
+def test_a_medium_that_cannot_be_read_is_damage(path, monkeypatch):
+    write(path)
+    really = LocalSource.read_range
+
+    def fails(self, key, start, size):
+        if key == "b/lines/c/1/0" and start:
+            raise OSError(errno.EIO, os.strerror(errno.EIO))
+        return really(self, key, start, size)
+
+    monkeypatch.setattr(LocalSource, "read_range", fails)
+    assert {found.arm for found in verify(path).damage} == {"b"}
+    with pytest.raises(DataError, match="cannot be read"):
+        open_recording(path).cut(1064, 5)
