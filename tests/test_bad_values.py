@@ -149,6 +149,7 @@ OF_CLIENTS: dict[str, tuple[Callable[[Any], Any], str]] = {
     ),
     "two": (lambda c: c.start(lines=5, duration_s=1.0), r"^start: lines and duration_s exclude each other"),
     "path": (lambda c: c.start(5), r"start: path = 5: Input is not a valid path"),
+    "name": (lambda c: c.start("a\udcff.zarr"), r"^start: path '.*a\\udcff\.zarr' is not UTF-8"),
     "code": (lambda c: c.arm(code="blue"), r"arm: code = 'blue': Input should be 'rig', 'dark' or 'steady'"),
     "delays": (lambda c: c.arm(delays={"a": 1}), r"^arm: delays\.light_lead: Field required"),
     "text": (lambda c: c.mark(5), r"mark: text = 5: Input should be a valid string"),

@@ -204,8 +204,10 @@ def request(command: str, model: type[R], **fields: Any) -> R:
         where = ".".join(map(str, first["loc"]))
         # Fields that exclude each other have no place, and name themselves; what is missing has no value.
         value = "" if first["type"] == "missing" else f" = {shown(first['input'])}"
-        what = f"{where}{value}: " if where else ""
-        raise UsageError(shortened(f"{command}: {what}{own_words(first['msg'])}", 1000)) from error
+        words = own_words(first["msg"])
+        # our own words about a field name it, with its value
+        what = f"{where}{value}: " if where and not words.startswith(f"{where} ") else ""
+        raise UsageError(shortened(f"{command}: {what}{words}", 1000)) from error
 
 
 def states_of(states: Collection[State] | State) -> tuple[State, ...]:
