@@ -51,7 +51,8 @@ class Glimpser:
                 await self._changed.wait()
             try:
                 await self._run_process()
-            except OSError as error:  # no process can be started now: the host is out of memory or numbers
+            # No process, or no thread for it, can be started now: the host is out of memory or numbers.
+            except (OSError, RuntimeError) as error:
                 log.warning("no glimpses: their process cannot be started: %s", error)
             if self._watchers:
                 await asyncio.sleep(AGAIN_S)

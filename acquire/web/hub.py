@@ -68,6 +68,11 @@ class Hub:
                     await self._follow(reader)
                 except (AcquireError, OSError) as error:
                     self._lose(error)
+                # Such as no thread for a connection. The last state must not be shown for ever.
+                except Exception as error:
+                    if str(error) != self.why:  # once, and not at every try
+                        log.exception("following the daemon")
+                    self._lose(error)
                 await asyncio.sleep(RETRY_S)
         finally:
             watch.cancel()

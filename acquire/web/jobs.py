@@ -156,6 +156,9 @@ class Jobs:
             await self._carry_out(job)
         except (OSError, AcquireError) as error:
             job.update(state="failed", text=str(error))
+        except Exception as error:  # a defect, or no thread for its process: the others still have their turn
+            log.exception("job %d", job.facts.id)
+            job.update(state="failed", text=f"it could not be carried out: {error!r}")
 
     async def _carry_out(self, job: _Job) -> None:
         name, words = "", job.words

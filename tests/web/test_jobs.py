@@ -17,13 +17,18 @@ from page_server import PageServer
 from served import api
 from store_helpers import fill, make_spec
 
+from acquire.client import AsyncClient
 from acquire.config import load_rig, load_scene
 from acquire.daemon.endpoint import Endpoint
+from acquire.daemon.facts import Setup
 from acquire.daemon.service import Service
 from acquire.simulate import simulate
 from acquire.store import RecordingWriter, RunCondition
 from acquire.web import glimpser, jobs, worker
+from acquire.web.archive import Archive
+from acquire.web.hub import Hub
 from acquire.web.job_words import free_name, recording_words
+from acquire.web.live import Live
 from acquire.web.messages import JobFacts, JobRequest
 
 LONG = """
@@ -62,9 +67,73 @@ def test_a_job_whose_page_died_while_it_was_started_does_not_begin(tmp_path: Pat
         assert bool(done.stdout) is begins
 
 
+def test_a_job_that_fails_unexpectedly_does_not_end_the_queue(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "r.zarr").mkdir()
+    really, refusals = asyncio.create_subprocess_exec, [RuntimeError("can't start new thread")]
+
+    async def start(*_: Any, **how: Any) -> asyncio.subprocess.Process:
+        if refusals:
+            raise refusals.pop()
+        return await really(sys.executable, "-c", "", **how)
+
+    monkeypatch.setattr(asyncio, "create_subprocess_exec", start)
+
+    async def two() -> list[str]:
+        queue = jobs.Jobs(tmp_path, Archive(tmp_path), tmp_path / "c.sock")
+        for _ in range(2):
+            queue.add(JobRequest(kind="cut", recording="r.zarr", first_line=0, lines=1))
+        running = asyncio.create_task(queue.run())
+        try:
+            async with asyncio.timeout(60):
+                while {job.state for job in queue.list()} & {"waiting", "running"}:
+                    await asyncio.sleep(0.01)
+        finally:
+            running.cancel()
+            await asyncio.gather(running, return_exceptions=True)
+        return [f"{job.state}: {job.text}" for job in queue.list()]
+
+    last, first = asyncio.run(two())
+    assert first == 'failed: it could not be carried out: RuntimeError("can\'t start new thread")'
+    assert last == "done: "
+
+
+def test_a_page_that_could_not_connect_for_want_of_a_thread_connects(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It showed its last state for ever."""
+    service, socket = Service(rig_config(tmp_path), lambda _: FakeRun()), tmp_path / "c.sock"
+    really, refusals = AsyncClient.setup, [RuntimeError("can't start new thread")]
+
+    async def setup(client: AsyncClient) -> Setup:
+        if refusals:
+            raise refusals.pop()
+        return await really(client)
+
+    monkeypatch.setattr(AsyncClient, "setup", setup)
+
+    async def follow() -> str:
+        hub = Hub(socket, Live)
+        running = asyncio.create_task(hub.run())
+        whys = set()
+        try:
+            async with asyncio.timeout(60):
+                while not hub.connected:
+                    whys.add(hub.why)
+                    await asyncio.sleep(0.01)
+        finally:
+            running.cancel()
+            await asyncio.gather(running, return_exceptions=True)
+        return " ".join(whys)
+
+    with contextlib.closing(Endpoint(socket)) as endpoint, api(service, endpoint):
+        assert "can't start new thread" in asyncio.run(follow())
+
+
 def test_glimpses_come_once_a_process_can_be_started_again(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(glimpser, "AGAIN_S", 0.01)
-    really, refusals = asyncio.create_subprocess_exec, [BlockingIOError(11, "no process")]
+    really, refusals = asyncio.create_subprocess_exec, [BlockingIOError(11, "no process"), RuntimeError("x")]
 
     async def start(*_: Any, **how: Any) -> asyncio.subprocess.Process:
         if refusals:
