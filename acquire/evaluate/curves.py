@@ -132,8 +132,12 @@ def fit_sine(
     if frequency_hz is None and np.ptp(values) <= CONSTANT_SWING * np.abs(values).max():
         return fit_constant(values)
     if frequency_hz is None:
-        start = _spectrum_peak(values, interval_s) if guess_hz is None else guess_hz
-        frequency_hz, harmonics = _refine(values, times_s, start, harmonics)
+        if guess_hz is None:
+            size = SPECTRUM_PADDING * len(values)
+            spectrum = np.abs(np.fft.rfft(values - values.mean(), size))
+            # Without its ends: no sinusoid of frequency 0, or of half the sampling rate, can be fitted.
+            guess_hz = (1 + int(np.argmax(spectrum[1:-1]))) / (size * interval_s)
+        frequency_hz, harmonics = _refine(values, times_s, guess_hz, harmonics)
     else:
         harmonics = _visible_harmonics(frequency_hz, interval_s, harmonics)
     coefficients, residual = _project(values, times_s, frequency_hz, harmonics)
@@ -198,14 +202,6 @@ def _check_curve(values: NDArray[np.float64], interval_s: float, harmonics: int)
             f"the sampling interval cannot be {interval_s} s", possible="a positive number of seconds"
         )
     check_finite(values, "the curve")
-
-
-def _spectrum_peak(values: NDArray[np.float64], interval_s: float) -> float:
-    size = SPECTRUM_PADDING * len(values)
-    spectrum = np.abs(np.fft.rfft(values - values.mean(), size))
-    # Without its ends: no sinusoid of frequency 0, or of half the sampling rate, can be fitted.
-    peak = 1 + int(np.argmax(spectrum[1:-1]))
-    return peak / (size * interval_s)
 
 
 def _visible_harmonics(frequency_hz: float, interval_s: float, harmonics: int) -> int:
