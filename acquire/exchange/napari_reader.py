@@ -69,7 +69,23 @@ def read_recording(path: Any) -> list[Layer]:
     The overview is hidden at first; it shows the whole recording at once.
     """
     recording = open_recording(str(path))
-    arms = [_arm(recording, arm, number) for number, arm in enumerate(ARMS)]
+    arms: list[Layer] = []
+    for number, arm in enumerate(ARMS):
+        stack = pages(recording, arm)
+        # `rgb` and `multiscale` are stated, since napari would guess them from the shape.
+        options = {
+            "name": f"{_name(recording)}, arm {arm}",
+            "translate": [0, 0, number * (stack.shape[2] + GAP)],
+            "contrast_limits": _limits(stack),
+            "multiscale": False,
+            "rgb": False,
+            "metadata": {
+                "first_line": recording.first_line,
+                "lines_of_a_page": PAGE_LINES,
+                **recording.info(),
+            },
+        }
+        arms.append((stack, options, "image"))
     overviews = [_overview(recording, arm, layer) for arm, layer in zip(ARMS, arms, strict=True)]
     return [*(layer for layer in overviews if layer is not None), *arms]
 
@@ -90,20 +106,6 @@ def _overview(recording: Recording, arm: str, lines: Layer) -> Layer | None:
         "metadata": {"first_line": found.first_line, "lines_per_row": found.lines_per_row},
     }
     return found.rows, options, "image"
-
-
-def _arm(recording: Recording, arm: str, number: int) -> Layer:
-    stack = pages(recording, arm)
-    # `rgb` and `multiscale` are stated, since napari would guess them from the shape.
-    options = {
-        "name": f"{_name(recording)}, arm {arm}",
-        "translate": [0, 0, number * (stack.shape[2] + GAP)],
-        "contrast_limits": _limits(stack),
-        "multiscale": False,
-        "rgb": False,
-        "metadata": {"first_line": recording.first_line, "lines_of_a_page": PAGE_LINES, **recording.info()},
-    }
-    return stack, options, "image"
 
 
 def _name(path: object) -> str:
