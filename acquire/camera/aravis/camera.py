@@ -195,7 +195,10 @@ class AravisCamera:
             missed = self._missed.count()
         except CameraError as error:
             raise CameraLostError(f"camera {self._spec.serial} is gone: {error.message}") from error
-        underruns = self._starved_frames()
+        counts = c_uint64(), c_uint64(), c_uint64()
+        self._library.arv_stream_get_statistics(self._stream, *map(byref, counts))
+        # Of completed, failed and starved buffers. Rounded up: a frame may be counted only in part so far.
+        underruns = math.ceil(counts[2].value / self._packets)
         for buffer in buffers:
             # The stream was ended before this buffer was filled: it stands for no frame.
             if self._library.arv_buffer_get_status(buffer) == _ABORTED:
@@ -207,12 +210,6 @@ class AravisCamera:
             for idle in free:
                 self._taken.remove(idle)
                 self._give(self._stream, idle)
-
-    def _starved_frames(self) -> int:
-        counts = c_uint64(), c_uint64(), c_uint64()
-        self._library.arv_stream_get_statistics(self._stream, *map(byref, counts))
-        # Of completed, failed and starved buffers. Rounded up: a frame may be counted only in part so far.
-        return math.ceil(counts[2].value / self._packets)
 
     def _frame(self, buffer: int, underruns: int, missed: int) -> Frame:
         library, size = self._library, c_size_t()
