@@ -222,6 +222,7 @@ def status(
             raise UsageError(f"the daemon has no state {wait!r}{near}", possible=", ".join(waits))
         with _daemon(socket) as daemon:
             reached = daemon.wait(waits[wait], timeout)
+        # `--watch` begins with a status of its own.
         if not watch:
             show(reached, json)
     if watch:

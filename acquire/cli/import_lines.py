@@ -157,6 +157,7 @@ def import_lines(
     columns = {"a": _columns(columns_a), "b": _columns(columns_b)}
     with ExitStack() as held:
         arms = _arms(held, files, layout, columns, arm)
+        # The characters of a rig's name, after which other runs are named.
         run_id = re.sub(r"[^A-Za-z0-9._-]", "_", PurePosixPath(out).stem) or "imported"
         with stage_progress(f"importing {PurePosixPath(out).name}") as advance:
             done = import_lines(arms, instrument, out, run_id, advance, most_lines=lines)

@@ -124,6 +124,7 @@ def verify(recording: PlaceArgument, json: JsonFlag = False) -> None:
         _print_list("contradictions", found.contradictions)
         _print_list("note", found.notes)
     if not found.intact:
+        # No message: the list above, or the JSON, says what is wrong.
         raise typer.Exit(DataError.exit_code)
 
 
@@ -213,6 +214,7 @@ def upload(
 
     def report(done: Mirrored) -> None:
         if not json:
+            # Standard output is for the result.
             say(f"{url}: {done.lines} lines, {quantity(done.bytes, 'B')} copied", err=True)
 
     with stage_progress(f"copying {recording.name}") as progress:

@@ -49,6 +49,7 @@ def _display(*, as_json: bool) -> Iterator[Callable[[Any], None]]:
                 say(json_text({"error": status.to_dict()} if ended else status))
             else:
                 say(f"{time.strftime('%H:%M:%S')} {status.message if ended else status_line(status)}")
+            # In a pipe the line would otherwise wait until a buffer is full.
             sys.stdout.flush()
 
         yield write

@@ -259,4 +259,5 @@ def _correlation(theory: NDArray[np.float64], measured: NDArray[np.float64]) -> 
     for curve in (theory, measured):
         if np.ptp(curve) <= CONSTANT_SWING * np.abs(curve).max():
             return None
+    # Without a constant, whose correlation numpy would compute as 0 / 0.
     return float(np.corrcoef(theory, measured)[0, 1])
