@@ -24,7 +24,7 @@ def linearity(
     recordings: Annotated[
         list[str] | None,
         typer.Argument(
-            metavar="RECORDING...",
+            metavar="RECORDING",
             help="Evaluate these recordings of an earlier ramp. Default: record a new ramp.",
         ),
     ] = None,

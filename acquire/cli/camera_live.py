@@ -35,7 +35,7 @@ def live(
         typer.Option(
             "--config",
             "-c",
-            metavar="FILE",
+            metavar="RIG",
             autocompletion=rigs,
             help="Open the cameras of this rig file. Default: read the daemon's lines.",
         ),

@@ -37,7 +37,7 @@ def import_lines(
     files: Annotated[
         list[Path],
         typer.Argument(
-            metavar="FILE...",
+            metavar="FILE",
             help="One file for each arm (a, then b), or one file with both: .npy, .h5, .tif or .raw.",
         ),
     ],
@@ -45,6 +45,8 @@ def import_lines(
     config: Annotated[
         str | None,
         typer.Option(
+            "--config",
+            "-c",
             metavar="RIG",
             autocompletion=rigs,
             help="Rig file with the geometry, code, trigger and cameras. The other options override it.",

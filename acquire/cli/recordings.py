@@ -158,7 +158,9 @@ def recover(recording: RecordingArgument, json: JsonFlag = False) -> None:
 
 def hold(
     recording: RecordingArgument,
-    first_line: FirstLineOption = None,
+    first_line: Annotated[
+        int | None, typer.Option(help="Number of the first line, as counted by the trigger.")
+    ] = None,
     lines: Annotated[
         int | None, typer.Option(help="Number of lines. They may include lines that are not recorded yet.")
     ] = None,
@@ -193,7 +195,10 @@ def upload(
     recording: RecordingArgument,
     url: Annotated[
         str,
-        typer.Argument(help="URL of the copy: s3://bucket/NAME.zarr, or any other URL that fsspec supports."),
+        typer.Argument(
+            metavar="URL",
+            help="URL of the copy: s3://bucket/NAME.zarr, or any other URL that fsspec supports.",
+        ),
     ],
     follow: Annotated[
         bool, typer.Option("--follow", help="Keep copying until the recording is sealed.")

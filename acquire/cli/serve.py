@@ -23,7 +23,7 @@ def serve(
         typer.Option(
             "--config",
             "-c",
-            metavar="FILE",
+            metavar="RIG",
             autocompletion=rigs,
             help="Rig file, or the name of a built-in rig.",
         ),

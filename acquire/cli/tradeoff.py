@@ -90,7 +90,10 @@ def tradeoff(
     budget: Annotated[
         float,
         typer.Option(
-            parser=seconds, metavar="TIME", help="Time limit for each run. Runs that reach it are marked."
+            parser=seconds,
+            metavar="TIME",
+            help=f"Time limit for each run. Runs that reach it are marked. Default: {LONGEST_S:g}s.",
+            show_default=False,
         ),
     ] = LONGEST_S,
     tile: TileOption = None,

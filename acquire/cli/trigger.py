@@ -68,7 +68,10 @@ def info(
 def load(
     file: Annotated[
         Path,
-        typer.Argument(help="File with the code: text of 0 and 1 (white space is ignored), or a .npy array."),
+        typer.Argument(
+            metavar="FILE",
+            help="File with the code: text of 0 and 1 (white space is ignored), or a .npy array.",
+        ),
     ],
     config: ConfigOption = "rig-demo",
     url: UrlOption = None,
