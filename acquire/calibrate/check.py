@@ -1,4 +1,4 @@
-"""Check of a calibration against a new recording: is it still true?"""
+"""Check of a calibration against a new recording: is it still valid?"""
 
 from __future__ import annotations
 
