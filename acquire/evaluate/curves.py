@@ -174,6 +174,8 @@ def compare_curve(
             f"a curve {measured.shape} cannot be compared with a theory {theory.shape}",
             possible="curves of the same length",
         )
+    # a constant has no correlation: numpy would divide 0 by 0
+    swing = all(np.ptp(curve) > CONSTANT_SWING * np.abs(curve).max() for curve in (theory, measured))
     # theory decides whether a curve changes: noise alone always fits some sinusoid
     theory_fit = fit_sine(theory, interval_s, harmonics=harmonics)
     check_finite(measured, "the measured curve")
@@ -183,7 +185,7 @@ def compare_curve(
         measured=fit_sine(measured, interval_s, harmonics=harmonics)
         if theory_fit.amplitude
         else fit_constant(measured),
-        correlation=_correlation(theory, measured),
+        correlation=float(np.corrcoef(theory, measured)[0, 1]) if swing else None,
         level_ratio=float(measured.mean() / theory.mean()) if theory.mean() else None,
         rms_error=float(np.sqrt(np.mean(np.square(measured - theory)))),
     )
@@ -253,11 +255,3 @@ def _project(
     design = np.stack(columns, axis=1)
     coefficients = np.linalg.lstsq(design, values, rcond=None)[0].astype(np.float64, copy=False)
     return coefficients, values - design @ coefficients
-
-
-def _correlation(theory: NDArray[np.float64], measured: NDArray[np.float64]) -> float | None:
-    for curve in (theory, measured):
-        if np.ptp(curve) <= CONSTANT_SWING * np.abs(curve).max():
-            return None
-    # Without a constant, whose correlation numpy would compute as 0 / 0.
-    return float(np.corrcoef(theory, measured)[0, 1])

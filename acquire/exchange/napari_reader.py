@@ -18,7 +18,7 @@ from acquire.store import format_of, open_recording, open_video
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from acquire.store import Recording, VideoFile
+    from acquire.store import Recording
 
 Layer = tuple[Any, dict[str, Any], str]
 SAMPLED = 5
@@ -48,11 +48,14 @@ def read_video(path: Any) -> list[Layer]:
     reason = "not known which frames are trusted" if trusted is None else "no frame is trusted"
     name = f"{_name(path)} ({f'frames {kept.start} to {kept.stop - 1}' if trusted else reason})"
     step, origin = file.scale, file.origin
+    # older videos have no channel, and no window of black and white in it
+    channels = file.attrs["ome"].get("omero", {}).get("channels", ())
+    windows = [(float(each["window"]["start"]), float(each["window"]["end"])) for each in channels]
     options = {
         "name": name,
         "scale": list(step),
         "translate": [origin[0] + step[0] * kept.start, *origin[1:]],
-        "contrast_limits": _window(file),
+        "contrast_limits": windows[0] if windows else _limits(frames(file, range(len(file.time_ns)))),
         "multiscale": False,
         "rgb": False,
         "metadata": {
@@ -110,15 +113,6 @@ def _overview(recording: Recording, arm: str, lines: Layer) -> Layer | None:
 
 def _name(path: object) -> str:
     return str(path).rstrip("/").rpartition("/")[2].removesuffix(".zarr")
-
-
-def _window(file: VideoFile) -> tuple[float, float]:
-    """Return the black and white levels recorded in the video; for an older one, from some of its frames."""
-    channels = file.attrs["ome"].get("omero", {}).get("channels", ())
-    # there is one channel, and in older videos none
-    for channel in channels:
-        return float(channel["window"]["start"]), float(channel["window"]["end"])
-    return _limits(frames(file, range(len(file.time_ns))))
 
 
 def _limits(stack: Stack) -> tuple[float, float]:

@@ -60,7 +60,10 @@ class SideBySide:
             # a part that lost lines has blocks that begin and end elsewhere
             first = max(block.first_line for block in blocks)
             end = min(block.first_line + len(block.flags) for block in blocks)
-            self._waiting = [_from(block, end) for block in blocks]
+            for number, block in enumerate(blocks):
+                skip = max(0, end - block.first_line)
+                rest = CameraBlock(block.first_line + skip, block.pixels[skip:], block.flags[skip:])
+                self._waiting[number] = rest if len(rest.flags) else None
             if first < end:
                 self._delivered += end - first
                 pixels: NDArray[Any] = np.zeros((end - first, self._opener.width), blocks[0].pixels.dtype)
@@ -104,11 +107,3 @@ class SideBySide:
     def close(self) -> None:
         for part in self._parts:
             part.close()
-
-
-def _from(block: CameraBlock, line: int) -> CameraBlock | None:
-    """Return the part of a block from a line on, None if there is none."""
-    skip = max(0, line - block.first_line)
-    if skip >= len(block.flags):
-        return None
-    return CameraBlock(block.first_line + skip, block.pixels[skip:], block.flags[skip:])

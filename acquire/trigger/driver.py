@@ -172,8 +172,14 @@ class TriggerDriver:
                 self._stopped.wait(timeout_s)
             return []
         try:
-            patience_s = self._show_life(device)
-            return tags.take(device.link.tags(min(timeout_s, patience_s)))
+            if self._config.watchdog_s:
+                # It has to be reset while tags are taken; any valid request does that.
+                patience_s = min(self._config.watchdog_s / _SIGNS_OF_LIFE_PER_WATCHDOG, _SIGN_OF_LIFE_S)
+                if time.monotonic() > self._sign_of_life_s + patience_s:
+                    device.read(r.STATUS)
+                    self._sign_of_life_s = time.monotonic()
+                timeout_s = min(timeout_s, patience_s)
+            return tags.take(device.link.tags(timeout_s))
         except TriggerError as error:
             raise TriggerError(f"{error.message}; its tags have reported {tags}", hint=error.hint) from error
 
@@ -262,16 +268,6 @@ class TriggerDriver:
         if self._device is not None and self._device.link.dead is not None:
             self.release()
         return self.device()
-
-    def _show_life(self, device: Device) -> float:
-        """Reset the watchdog while tags are taken; return after what time it is due again."""
-        if not self._config.watchdog_s:
-            return float("inf")
-        patience_s = min(self._config.watchdog_s / _SIGNS_OF_LIFE_PER_WATCHDOG, _SIGN_OF_LIFE_S)
-        if time.monotonic() > self._sign_of_life_s + patience_s:
-            device.read(r.STATUS)  # any valid request resets it
-            self._sign_of_life_s = time.monotonic()
-        return patience_s
 
 
 def run_number(run_id: str) -> int:
