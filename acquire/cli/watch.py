@@ -59,6 +59,7 @@ def _display(*, as_json: bool) -> Iterator[Callable[[Any], None]]:
     from rich.text import Text
 
     # Refreshed by `draw` alone, at the user's interval.
+    # Visible: rich would otherwise cut a status that is longer than the terminal.
     with Live(console=Console(), auto_refresh=False, vertical_overflow="visible") as live:
 
         def draw(status: Any) -> None:
