@@ -206,8 +206,15 @@ def _write(
     lost = dict.fromkeys(ARMS, 0)
     try:
         for first, reads in blocks:
-            for arm, readout in reads.items():
-                lost[arm] += _append(writer, tagger, arm, first, readout.result())
+            for arm, read in reads.items():
+                readout, white = read.result(), writer.spec.cameras[arm]["white_dn"]
+                full = (readout.pixels >= white).any(axis=1)
+                flags = readout.flags | np.where(full, np.uint16(LineFlag.SATURATED), np.uint16(0))
+                writer.append(tagger.tag(LineBlock(arm, first, readout.pixels, flags)))
+                edges = np.flatnonzero(np.diff(readout.missing, prepend=False, append=False))
+                for begin, end in edges.reshape(-1, 2).tolist():
+                    writer.add_gap(arm, first + begin, end - begin, Cause.CAMERA)
+                lost[arm] += int(readout.missing.sum())
             if first // _BLOCK_LINES % _COMMIT_BLOCKS == 0:
                 writer.commit()
             progress(min(first + _BLOCK_LINES, lines), lines)
@@ -235,19 +242,6 @@ def _read_ahead(
         if len(waiting) > 1:
             yield waiting.popleft()
     yield from waiting
-
-
-def _append(writer: RecordingWriter, tagger: Tagger, arm: str, first: int, readout: Readout) -> int:
-    """Write one block and return the number of its missing lines."""
-    white = writer.spec.cameras[arm]["white_dn"]
-    flags = readout.flags | np.where(
-        (readout.pixels >= white).any(axis=1), np.uint16(LineFlag.SATURATED), np.uint16(0)
-    )
-    writer.append(tagger.tag(LineBlock(arm, first, readout.pixels, flags)))
-    edges = np.flatnonzero(np.diff(readout.missing, prepend=False, append=False)).reshape(-1, 2)
-    for begin, end in edges.tolist():
-        writer.add_gap(arm, first + begin, end - begin, Cause.CAMERA)
-    return int(readout.missing.sum())
 
 
 def _spec(config: RigConfig, scene: SceneConfig) -> RecordingSpec:

@@ -9,8 +9,6 @@ sparse matrix, and a copy of the voxels, the lower limit for any operation on al
 from __future__ import annotations
 
 import argparse
-import time
-from collections.abc import Callable
 
 import numpy as np
 from scipy import sparse
@@ -18,7 +16,7 @@ from scipy import sparse
 from acquire.codes import mix_seed, prbs
 from acquire.forward import DualArm
 from acquire.geometry import Geometry
-from tools.results import add_option, recorded
+from tools.results import add_option, best_ms, recorded
 
 CASES = {
     "Fig. 9, 64 × 64 × 980": (64, 263, 3, 1),
@@ -26,16 +24,6 @@ CASES = {
     "Fig. 7 detail, 162 × 162 × 5": (54, 1313, 1, 820),
     "Fig. 6 static, 192 × 192": (64, 263, 1, 980),
 }
-
-
-def best_ms(work: Callable[[], object]) -> float:
-    work()
-    times = []
-    for _ in range(5):
-        started = time.perf_counter()
-        work()
-        times.append(time.perf_counter() - started)
-    return min(times) * 1e3
 
 
 def explicit(geometry: Geometry, code: np.ndarray, N_m: int, T_m: int) -> sparse.csr_array:

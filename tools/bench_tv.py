@@ -9,23 +9,12 @@ and one (scikit-image has no more). Prints milliseconds and the ratio, the best 
 from __future__ import annotations
 
 import argparse
-import time
-from collections.abc import Callable
 
 import numpy as np
 from skimage.restoration import denoise_tv_chambolle
 
 from acquire.recon.tv import FrameTv
-from tools.results import Run, add_option, recorded
-
-
-def best_ms(work: Callable[[], object]) -> float:
-    times = []
-    for _ in range(5):
-        started = time.perf_counter()
-        work()
-        times.append(time.perf_counter() - started)
-    return min(times) * 1e3
+from tools.results import Run, add_option, best_ms, recorded
 
 
 def main() -> None:
@@ -44,7 +33,6 @@ def measure(run: Run, options: argparse.Namespace) -> None:
     shape = (options.frames, options.side, options.side)
     frames = np.random.default_rng(0).random(shape, np.float32)
     tv = FrameTv(options.iterations)
-    tv.prox(frames, 0.1)  # compiles
     ours = best_ms(lambda: tv.prox(frames, 0.1))
 
     def library() -> None:

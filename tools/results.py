@@ -18,7 +18,8 @@ import re
 import shlex
 import subprocess
 import sys
-from collections.abc import Iterator
+import time
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
 from datetime import UTC, datetime
@@ -110,6 +111,17 @@ def recorded(benchmark: str, *, keep: bool, file: Path = FILE) -> Iterator[Run]:
         if keep and run.rows:
             with file.open("a", encoding="utf-8") as out:
                 out.write(json.dumps(asdict(run), ensure_ascii=False) + "\n")
+
+
+def best_ms(work: Callable[[], object]) -> float:
+    """Return the shortest of five times, after a first that compiles; neighbours only make them longer."""
+    work()
+    times = []
+    for _ in range(5):
+        started = time.perf_counter()
+        work()
+        times.append(time.perf_counter() - started)
+    return min(times) * 1e3
 
 
 def cpu_model(path: Path = Path("/proc/cpuinfo")) -> str:

@@ -1,9 +1,9 @@
-"""Alignment of arm B's image with arm A's: shift, turn and magnification, from a textured target at rest.
+"""Alignment of arm B's image with arm A's: shift, rotation and magnification, from a textured target at rest.
 
 Arm A's image is finely sampled along rows, arm B's along columns (`still`), and both are box-filtered alike.
 They are compared where a coarse column of A meets a coarse row of B in the scene, so that each is
 interpolated only along its own fine axis, where it is well sampled. Each point gives the displacement along
-one direction of texture. Over the field these give shift, turn and magnification by least squares.
+one direction of texture. Over the field these give shift, rotation and magnification by least squares.
 """
 
 from __future__ import annotations
@@ -98,7 +98,7 @@ def _undetermined() -> UsageError:
 
 
 def _units(geometry: Geometry) -> NDArray[np.float64]:
-    """Return the units of the six fitted numbers; turn and magnification are pixels at the field's edge."""
+    """Return the units of the six fitted numbers: those of rotation and magnification at the field's edge."""
     half = geometry.size / 2
     return np.array([1, 1, np.rad2deg(1 / half), 1 / half, 1, 1])
 
@@ -122,8 +122,8 @@ class _Images:
 class _Comparison:
     """Differences of the images at the points where their lattices cross, as a function of six numbers.
 
-    These are the shift (2), turn and magnification as pixels at the field's edge, and the factor and offset
-    of B's brightness relative to A's.
+    These are the shift (2), rotation and magnification as pixels at the field's edge, and the factor and
+    offset of B's brightness relative to A's.
     """
 
     def __init__(self, images: _Images, sigma: float) -> None:

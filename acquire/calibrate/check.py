@@ -1,4 +1,4 @@
-"""Check of a calibration against a new recording: is it still true?"""
+"""Check of a calibration against a new recording: is it still valid?"""
 
 from __future__ import annotations
 
@@ -84,7 +84,14 @@ def check(exposure: Exposure, known: Calibration, *, covered: bool = False) -> C
             # as `align` corrected the calibration's own flat
             quantities = without_field_edge(known.with_step(found), known.alignment.alignment)
             corrected = replace(found, quantities={**found.quantities, **quantities})
-        return Check((*_columns(corrected, known, "gain", "1"), *_balance(found, known)), doubts)
+        compared = list(_columns(corrected, known, "gain", "1"))
+        # The flats themselves, since an alignment may have corrected the balance of the calibration.
+        before = known.steps.get("flat", {}).get("part_a")
+        if before is not None:
+            change, balance = found.facts["part_a"] - before, found.quantities["balance"]
+            sure = float(np.hypot(*balance.uncertainty))
+            compared.append(Compared("arm A's part of the light", "1", change, sure, MATTERS["balance"]))
+        return Check(tuple(compared), doubts)
     if exposure.recording.fibre is not None:
         raise UsageError(
             f"{exposure.recording} shows a target behind a fibre, which is not compared tile by tile",
@@ -119,15 +126,6 @@ def _columns(found: Finding, known: Calibration, name: str, unit: str) -> Iterat
     limit = np.maximum(MATTERS[name], SURE * sure)
     at = np.unravel_index((np.abs(change) - limit).argmax(), change.shape)
     yield Compared(name, unit, float(change[at]), float(sure[at]), MATTERS[name])
-
-
-def _balance(found: Finding, known: Calibration) -> Iterator[Compared]:
-    """Compare the flats themselves, since an alignment may have corrected the balance of the calibration."""
-    before = known.steps.get("flat", {}).get("part_a")
-    if before is not None:
-        change, balance = found.facts["part_a"] - before, found.quantities["balance"]
-        sure = float(np.hypot(*balance.uncertainty))
-        yield Compared("arm A's part of the light", "1", change, sure, MATTERS["balance"])
 
 
 def _alignment(found: Finding, known: Calibration) -> Iterator[Compared]:

@@ -180,18 +180,17 @@ class FrameCount:
         bits = self._id_bits or next(bits for bits in _ID_BITS if self._largest_id < 1 << bits)
         ahead = (number - self._last_id) % (1 << bits)
         # More than half of the range ahead is less than half behind: a late frame, not a day of losses.
+        if ahead == 0 or ahead > 1 << (bits - 1):
+            return None
         # While the width is only assumed, a smaller number may be a late frame, which its time shows.
-        if ahead == 0 or ahead > 1 << (bits - 1) or (not self._id_bits and self._is_earlier(frame)):
+        assert self._last is not None
+        before, now = self._last.time_ns, frame.time_ns
+        if not self._id_bits and before is not None and now is not None and now < before:
             return None
         if number < self._last_id:
             self._id_bits = bits
             ahead -= self._skips(frame, number, ahead)
         return ahead
-
-    def _is_earlier(self, frame: FrameFacts) -> bool:
-        assert self._last is not None
-        before, now = self._last.time_ns, frame.time_ns
-        return before is not None and now is not None and now < before
 
     def _skips(self, frame: FrameFacts, number: int, ahead: int) -> bool:
         """Return whether ids skip 0, at a frame after a wrap; it is ``ahead`` frames ahead if they do not."""

@@ -230,7 +230,20 @@ class HarvestersCamera:
         self._held.clear()
         self._ready.clear()
         self._views.clear()  # before their memory is freed
-        _stop(self._acquirer)
+        with suppress(CameraError), translated("stop"):
+            self._acquirer.stop()
+            return
+        from genicam import gentl
+
+        # harvesters stops half-way if the camera is gone: the other half is done here.
+        acquirer, stream = self._acquirer, self._acquirer.data_streams[0]
+        for step in (
+            lambda: stream.stop_acquisition(gentl.ACQ_STOP_FLAGS_LIST.ACQ_STOP_FLAGS_KILL),
+            acquirer._release_buffers,
+            lambda: [each.flush_event_queue() for each in acquirer._new_buffer_event_monitor_dict.values()],
+        ):
+            with suppress(CameraError), translated("stop"):
+                step()
 
     def statistics(self) -> dict[str, int]:
         return self._assembly.statistics() if self._assembly else dict.fromkeys(STATISTICS, 0)
@@ -352,23 +365,6 @@ def _describe(info: Any) -> FoundCamera:
 _IDENTITY = ("serial_number", "model", "vendor", "version")
 # DEVICE_ACCESS_STATUS of GenTL. 0 is unknown and 1 is free for reading and writing.
 _ACCESS = {2: "open for reading only", 3: "not accessible", 4: "in use by another program", 5: "in use here"}
-
-
-def _stop(acquirer: Any) -> None:
-    """Stop with harvesters; if the camera is gone that fails half-way, so finish by hand."""
-    from genicam import gentl
-
-    with suppress(CameraError), translated("stop"):
-        acquirer.stop()
-        return
-    stream = acquirer.data_streams[0]
-    for step in (
-        lambda: stream.stop_acquisition(gentl.ACQ_STOP_FLAGS_LIST.ACQ_STOP_FLAGS_KILL),
-        acquirer._release_buffers,
-        lambda: [monitor.flush_event_queue() for monitor in acquirer._new_buffer_event_monitor_dict.values()],
-    ):
-        with suppress(CameraError), translated("stop"):
-            step()
 
 
 def _or(ask: Any, otherwise: Any) -> Any:

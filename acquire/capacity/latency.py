@@ -26,6 +26,7 @@ class Latencies:
 
     def add(self, latency_ns: int) -> None:
         self._words[min(max(latency_ns, 0) // self.STEP_NS, self.BINS - 1)] += 1
+        # The maximum has a word of its own, as it may lie far beyond the last bin.
         self._words[self.BINS] = max(self._words[self.BINS], latency_ns)
 
     def clear(self) -> None:

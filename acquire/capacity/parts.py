@@ -88,6 +88,7 @@ def measure_parts(load: Load, directory: Path) -> Parts:
     ]
 
     def pack(k: int) -> int:
+        # With the checksum, which the recorder computes of every chunk that it encodes.
         crc32c(encode(blocks[k % len(blocks)], load.codec).data)
         return load.block_lines
 

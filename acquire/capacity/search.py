@@ -60,6 +60,7 @@ def search_rate(
             good = rate
         else:
             bad = rate
+        # Until a rate has failed there is nothing to bisect.
         rate = good * 1.5 if bad == float("inf") else (good + bad) / 2
     return trials
 

@@ -31,9 +31,9 @@ def bench(
         typer.Option(
             "--config",
             "-c",
-            metavar="FILE",
+            metavar="RIG",
             autocompletion=rigs,
-            help="Rig file, or the name of a built-in one.",
+            help="Rig file, or the name of a built-in rig.",
         ),
     ] = "rig-demo",
     settings: Annotated[
@@ -48,7 +48,13 @@ def bench(
         Path | None, typer.Option(help="Directory to record in. Default: the one in the rig file.")
     ] = None,
     seconds: Annotated[
-        float, typer.Option(parser=seconds_between(0.1, 600), metavar="TIME", help="Duration of each run.")
+        float,
+        typer.Option(
+            parser=seconds_between(0.1, 600),
+            metavar="TIME",
+            help="Duration of each run. Default: 2s.",
+            show_default=False,
+        ),
     ] = 2.0,
     runs: Annotated[int, typer.Option(min=1, max=100, help="Maximum number of runs.")] = 9,
     json: JsonFlag = False,

@@ -141,7 +141,7 @@ def flat(
 def transfer(
     recordings: Annotated[
         list[str],
-        typer.Argument(metavar="RECORDING...", help="Recordings of flats, at one or several light levels."),
+        typer.Argument(metavar="RECORDING", help="Recordings of flats, at one or several light levels."),
     ],
     out: OutOption,
     json: JsonFlag = False,

@@ -28,7 +28,7 @@ def delay(
     recordings: Annotated[
         list[str] | None,
         typer.Argument(
-            metavar="RECORDING...",
+            metavar="RECORDING",
             help="Evaluate these recordings of an earlier sweep. Default: record a new sweep.",
         ),
     ] = None,

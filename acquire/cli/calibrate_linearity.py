@@ -24,7 +24,7 @@ def linearity(
     recordings: Annotated[
         list[str] | None,
         typer.Argument(
-            metavar="RECORDING...",
+            metavar="RECORDING",
             help="Evaluate these recordings of an earlier ramp. Default: record a new ramp.",
         ),
     ] = None,
@@ -103,6 +103,7 @@ def _ramp(out: str, directory: Path, lines: int, socket: Path | None, *, ask: bo
             window = TriggerWindow(open=0, close=lit)
             return record(daemon, "ramp", directory, lines, code="steady", window=window)
 
+        # First the dimmest: the levels in between follow from it.
         dimmest = level(max(1, ticks // PARTS))
         levels = level_ticks(dimmest, offset)
         brightest = max(levels, default=0)

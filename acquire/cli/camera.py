@@ -18,14 +18,14 @@ ConfigOption = Annotated[
     typer.Option(
         "--config",
         "-c",
-        metavar="FILE",
+        metavar="RIG",
         autocompletion=rigs,
-        help="Rig file, or the name of a built-in one. Default: search all cameras that the GenTL producers "
+        help="Rig file, or the name of a built-in rig. Default: search all cameras that the GenTL producers "
         "in GENICAM_GENTL64_PATH show.",
     ),
 ]
 SerialArgument = Annotated[
-    str, typer.Argument(help="Serial number of the camera. `acquire devices` lists them.")
+    str, typer.Argument(metavar="SERIAL", help="Serial number of the camera. `acquire devices` lists them.")
 ]
 
 

@@ -35,7 +35,7 @@ def live(
         typer.Option(
             "--config",
             "-c",
-            metavar="FILE",
+            metavar="RIG",
             autocompletion=rigs,
             help="Open the cameras of this rig file. Default: read the daemon's lines.",
         ),
@@ -107,6 +107,7 @@ def _print_line(elapsed_s: float, readings: dict[str, Reading | None], *, as_jso
         say(json_text({"time_s": round(elapsed_s, 2), **arms}))
     else:
         say(f"{elapsed_s:6.1f} s  " + "; ".join(f"{n}: {reading_text(r)}" for n, r in readings.items()))
+    # In a pipe the line would otherwise wait until a buffer is full.
     sys.stdout.flush()
 
 
@@ -119,5 +120,6 @@ def _readings(
         readings = source.take()
         elapsed_s = time.monotonic() - began_s
         yield elapsed_s, readings
+        # After the reading, so that even the shortest time yields one.
         if seconds is not None and elapsed_s >= seconds:
             return

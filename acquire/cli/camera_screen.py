@@ -92,6 +92,7 @@ def sparkline(values: list[float]) -> str:
     span = max(high - low, STEADY * middle)
     low = middle - span / 2
     steps = len(_BLOCKS) - 1
+    # The span is 0 only if all values are, as of a camera in the dark.
     return "".join(_BLOCKS[round((value - low) / span * steps) if span else 0] for value in values)
 
 

@@ -197,5 +197,6 @@ def dotted(table: dict[str, Any], prefix: str = "") -> Iterator[str]:
     for key, value in table.items():
         if isinstance(value, dict):
             yield from dotted(value, f"{prefix}{key}.")
+        # TOML has no null.
         elif value is not None:
             yield f"{prefix}{key} = {json_text(value)}"

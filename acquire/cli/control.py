@@ -56,10 +56,10 @@ def arm(
     """Start the trigger and the cameras without recording.
 
     The daemon first measures which line rate the ring, the codec and the disk sustain on this host. This
-    takes a second and is valid for ten minutes. If the best of three measurements is below the configured
-    rate, arm is refused with exit code 2; with simulated cameras, which wait for a busy host, it is only a
-    warning. Arm is also refused if recordings are to be uploaded and the store denies access; a store that
-    cannot be reached is only a warning.
+    takes half a second and is valid for ten minutes. If the best of three measurements is below the
+    configured rate, arm is refused with exit code 2; with simulated cameras, which wait for a busy host, it
+    is only a warning. Arm is also refused if recordings are to be uploaded and the store denies access; a
+    store that cannot be reached is only a warning.
 
     Example: [bold]acquire arm[/]
     """
@@ -120,7 +120,7 @@ def start(
 
 
 def mark(
-    text: Annotated[str, typer.Argument(help="Text of the mark, in your own words.")] = "",
+    text: Annotated[str, typer.Argument(metavar="TEXT", help="Text of the mark, in your own words.")] = "",
     socket: SocketOption = None,
     json: JsonFlag = False,
 ) -> None:
@@ -193,7 +193,8 @@ def status(
         typer.Option(
             parser=seconds,
             metavar="TIME",
-            help="Longest time to --wait for the state; then exit with code 4.",
+            help="Longest time to --wait for the state; then exit with code 4. Default: 60s.",
+            show_default=False,
         ),
     ] = 60.0,
     watch: Annotated[
@@ -201,7 +202,12 @@ def status(
     ] = False,
     every: Annotated[
         float,
-        typer.Option(parser=seconds, metavar="TIME", help="Time between two updates of --watch."),
+        typer.Option(
+            parser=seconds,
+            metavar="TIME",
+            help="Time between two updates of --watch. Default: 1s.",
+            show_default=False,
+        ),
     ] = 1.0,
     socket: SocketOption = None,
     json: JsonFlag = False,
@@ -222,6 +228,7 @@ def status(
             raise UsageError(f"the daemon has no state {wait!r}{near}", possible=", ".join(waits))
         with _daemon(socket) as daemon:
             reached = daemon.wait(waits[wait], timeout)
+        # `--watch` begins with a status of its own.
         if not watch:
             show(reached, json)
     if watch:

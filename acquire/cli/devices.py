@@ -30,7 +30,7 @@ def devices(
         typer.Option(
             "--config",
             "-c",
-            metavar="FILE",
+            metavar="RIG",
             autocompletion=rigs,
             help="Rig file whose devices are opened. Default: list all devices of this host.",
         ),

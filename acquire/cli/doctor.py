@@ -31,7 +31,7 @@ def doctor(
         typer.Option(
             "--config",
             "-c",
-            metavar="FILE",
+            metavar="RIG",
             autocompletion=rigs,
             help="Rig file, to also check its devices and requirements. Default: check the host only.",
         ),

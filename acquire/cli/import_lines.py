@@ -37,7 +37,7 @@ def import_lines(
     files: Annotated[
         list[Path],
         typer.Argument(
-            metavar="FILE...",
+            metavar="FILE",
             help="One file for each arm (a, then b), or one file with both: .npy, .h5, .tif or .raw.",
         ),
     ],
@@ -45,6 +45,8 @@ def import_lines(
     config: Annotated[
         str | None,
         typer.Option(
+            "--config",
+            "-c",
             metavar="RIG",
             autocompletion=rigs,
             help="Rig file with the geometry, code, trigger and cameras. The other options override it.",
@@ -157,6 +159,7 @@ def import_lines(
     columns = {"a": _columns(columns_a), "b": _columns(columns_b)}
     with ExitStack() as held:
         arms = _arms(held, files, layout, columns, arm)
+        # The characters of a rig's name, after which other runs are named.
         run_id = re.sub(r"[^A-Za-z0-9._-]", "_", PurePosixPath(out).stem) or "imported"
         with stage_progress(f"importing {PurePosixPath(out).name}") as advance:
             done = import_lines(arms, instrument, out, run_id, advance, most_lines=lines)

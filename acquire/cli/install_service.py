@@ -19,7 +19,7 @@ def register(app: typer.Typer) -> None:
 def install_service(
     config: Annotated[
         str,
-        typer.Option("--config", "-c", metavar="FILE", autocompletion=rigs, help="Rig file of the service."),
+        typer.Option("--config", "-c", metavar="RIG", autocompletion=rigs, help="Rig file of the service."),
     ],
     user: Annotated[
         bool,

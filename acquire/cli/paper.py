@@ -29,7 +29,7 @@ def register(app: typer.Typer) -> None:
 def paper(
     figures: Annotated[
         list[str] | None,
-        typer.Argument(metavar="FIGURE...", help=f"Figures: {', '.join(NAMES)}. Default: all of them."),
+        typer.Argument(metavar="FIGURE", help=f"Figures: {', '.join(NAMES)}. Default: all of them."),
     ] = None,
     out: Annotated[
         Path, typer.Option(metavar="DIR", help="New directory for the page and all its data.")

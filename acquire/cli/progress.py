@@ -113,7 +113,11 @@ class Progress:
         if console.is_terminal:
             self._bar = _bar(console)
             self._bar.add_task(
-                self._what, total=self._total or None, completed=self._done, amount=self.amount
+                # without a total rich shows that something moves
+                self._what,
+                total=self._total or None,
+                completed=self._done,
+                amount=self.amount,
             )
             self._bar.start()
             return
@@ -157,12 +161,14 @@ def _bar(console: Any) -> Any:
     from rich.progress import Progress as Bars
 
     return Bars(
+        # a file's name may have brackets, which rich would take for a style
         TextColumn("{task.description}", markup=False),
         BarColumn(),
         TextColumn("{task.fields[amount]}", markup=False),
         TimeElapsedColumn(),
         TimeRemainingColumn(),
         console=console,
+        # the bar is gone before the results are printed
         transient=True,
     )
 

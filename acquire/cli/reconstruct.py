@@ -24,7 +24,7 @@ from acquire.errors import EXIT_INTERRUPTED, UsageError
 if TYPE_CHECKING:
     from acquire.cli.reconstruct_request import Arguments, Prepared
     from acquire.fibre import Tile
-    from acquire.reconstruct import Options, Outcome, VideoRequest
+    from acquire.reconstruct import Outcome
     from acquire.store import Recording
 
 
@@ -304,7 +304,12 @@ def _make(
     where: tuple[int | None, str | None],
     began: float,
 ) -> list[Outcome]:
-    """Make the videos one after the other, until the first that is interrupted."""
+    """Make the videos one after the other, until the first that is interrupted.
+
+    ``where`` is a number of processes and a cluster; ``began`` starts the time limit.
+    """
+    from acquire.reconstruct import Watcher, combine, open_pool
+
     outcomes: list[Outcome] = []
     for place, request in zip(places, prepared.requests.values(), strict=True):
         options = prepared.options
@@ -314,9 +319,20 @@ def _make(
             elapsed_s = time.monotonic() - began
             share_s = (options.budget_s - elapsed_s) / (len(places) - len(outcomes))
             options = replace(options, budget_s=max(elapsed_s + share_s, LEAST_S))
-        outcomes.append(_run(recording, request, place, options, where, began))
+        tasks, (workers, cluster) = len(request.stretches) * max(1, len(request.tiles)), where
+        if workers is None and options.device != "cpu":
+            workers = 1  # one process fills a GPU
+        name = f"reconstructing {PurePosixPath(place).name}"
+        with (
+            stop_on_interrupt("finishing the current sub-segments with their results so far") as stopped,
+            stage_progress(name, QUICKER if options.budget_s is None else "") as advance,
+        ):
+            watcher = Watcher(tasks, advance, stopped.is_set)
+            with open_pool(tasks, workers, cluster, watcher) as pool:
+                outcome = combine(recording, request, place, options, pool, watcher, began)
+        outcomes.append(outcome)
         # Ctrl-C is meant for the whole command.
-        if outcomes[-1].interrupted:
+        if outcome.interrupted:
             break
     return outcomes
 
@@ -360,28 +376,3 @@ def _age_s() -> float:
     # The age of a program that calls us, such as a test's, would be taken off the budget.
     program = Path(getattr(sys.modules["__main__"], "__file__", None) or "")
     return process_age_s() if "acquire" in (program.name, program.parent.name) else 0.0
-
-
-def _run(
-    recording: Recording,
-    request: VideoRequest,
-    out: str,
-    options: Options,
-    where: tuple[int | None, str | None],
-    began: float,
-) -> Outcome:
-    """Make one video. ``where`` is a number of processes and a cluster; ``began`` starts the time limit."""
-    from acquire.reconstruct import Watcher, combine, open_pool
-
-    tasks, (workers, cluster) = len(request.stretches) * max(1, len(request.tiles)), where
-    if workers is None and options.device != "cpu":
-        workers = 1  # one process fills a GPU
-    with (
-        stop_on_interrupt("finishing the current sub-segments with their results so far") as stop_requested,
-        stage_progress(
-            f"reconstructing {PurePosixPath(out).name}", QUICKER if options.budget_s is None else ""
-        ) as advance,
-    ):
-        watcher = Watcher(tasks, advance, stop_requested.is_set)
-        with open_pool(tasks, workers, cluster, watcher) as pool:
-            return combine(recording, request, out, options, pool, watcher, began)

@@ -124,6 +124,7 @@ def verify(recording: PlaceArgument, json: JsonFlag = False) -> None:
         _print_list("contradictions", found.contradictions)
         _print_list("note", found.notes)
     if not found.intact:
+        # No message: the list above, or the JSON, says what is wrong.
         raise typer.Exit(DataError.exit_code)
 
 
@@ -157,7 +158,9 @@ def recover(recording: RecordingArgument, json: JsonFlag = False) -> None:
 
 def hold(
     recording: RecordingArgument,
-    first_line: FirstLineOption = None,
+    first_line: Annotated[
+        int | None, typer.Option(help="Number of the first line, as counted by the trigger.")
+    ] = None,
     lines: Annotated[
         int | None, typer.Option(help="Number of lines. They may include lines that are not recorded yet.")
     ] = None,
@@ -192,7 +195,10 @@ def upload(
     recording: RecordingArgument,
     url: Annotated[
         str,
-        typer.Argument(help="URL of the copy: s3://bucket/NAME.zarr, or any other URL that fsspec supports."),
+        typer.Argument(
+            metavar="URL",
+            help="URL of the copy: s3://bucket/NAME.zarr, or any other URL that fsspec supports.",
+        ),
     ],
     follow: Annotated[
         bool, typer.Option("--follow", help="Keep copying until the recording is sealed.")
@@ -213,6 +219,7 @@ def upload(
 
     def report(done: Mirrored) -> None:
         if not json:
+            # Standard output is for the result.
             say(f"{url}: {done.lines} lines, {quantity(done.bytes, 'B')} copied", err=True)
 
     with stage_progress(f"copying {recording.name}") as progress:

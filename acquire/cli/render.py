@@ -23,7 +23,7 @@ def register(app: typer.Typer) -> None:
 def render(
     video: Annotated[
         list[str],
-        typer.Argument(metavar="VIDEO...", help="Videos, by path or URL. Several are shown side by side."),
+        typer.Argument(metavar="VIDEO", help="Videos, by path or URL. Several are shown side by side."),
     ],
     out: Annotated[
         Path,

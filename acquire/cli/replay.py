@@ -167,21 +167,15 @@ def _replay_without_loss(stored: Recording, out: Path, speed: float) -> tuple[fl
                 return pace, compare(stored, open_recording(out), advance)
         if last:
             break
-        _remove(out)
+        # Nothing of it existed before `_record`, nor did the segments in which the recording went on.
+        with suppress(AcquireError):  # no recording was begun, or it is damaged
+            for name in open_recording(out).attrs.get("segments", ()):
+                shutil.rmtree(out.with_name(name), ignore_errors=True)
+        shutil.rmtree(out, ignore_errors=True)
     raise AcquireError(
         f"the replay to {out} lost lines at every speed that was tried, down to {pace:g}: {fault}",
         hint="fewer other processes on this host, or more memory, so that the ring can hold the recording",
     )
-
-
-def _remove(out: Path) -> None:
-    """Remove what `_record` made, with the segments in which it went on; nothing of it existed before."""
-    from acquire.store import open_recording
-
-    with suppress(AcquireError):  # no recording was begun, or it is damaged
-        for name in open_recording(out).attrs.get("segments", ()):
-            shutil.rmtree(out.with_name(name), ignore_errors=True)
-    shutil.rmtree(out, ignore_errors=True)
 
 
 def _record(stored: Recording, out: Path, speed: float) -> str | None:

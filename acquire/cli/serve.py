@@ -23,7 +23,7 @@ def serve(
         typer.Option(
             "--config",
             "-c",
-            metavar="FILE",
+            metavar="RIG",
             autocompletion=rigs,
             help="Rig file, or the name of a built-in rig.",
         ),
@@ -80,6 +80,7 @@ def serve(
     write_log(rig.service.level)
     logging.getLogger("uvicorn").setLevel(logging.WARNING)
     if owned:
+        # A daemon thread, since it is blocked until the owner ends: nothing could join it.
         threading.Thread(target=end_with_owner, name="acquire-owner", daemon=True).start()
     raise typer.Exit(run_daemon(rig, str(path), read))
 

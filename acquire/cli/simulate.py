@@ -91,6 +91,7 @@ def simulate(
         count = max(1, round(duration * rig.line_rate_hz))
     facts: dict[str, Any] = {}
     if out is not None and not explain:
+        # Refused now, and not after the lines have been computed.
         check_new_path(out)
         with stage_progress(f"simulating {out.name}") as advance:
             done = run(rig, shown, out, count, advance)
@@ -128,6 +129,7 @@ def _print_study(found: Study, *, explain: bool) -> None:
         f"signal {found.signal_dn:.3g} DN RMS, temporal noise {found.noise_dn:.3g} DN RMS (rounding included)"
     )
     if found.effects:
+        # An effect that loses lines has no size: the lines that are left do not change.
         by_size = sorted(found.effects, key=lambda worth: -(worth.noises or 0))
         changes = [(w.effect, f"{w.change_dn:.3g}", f"{w.noises or 0:.3g}", verdict(w)) for w in by_size]
         print_table(("left out", "change (DN)", "change (noise)", "verdict"), changes)

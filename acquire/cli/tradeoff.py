@@ -90,7 +90,10 @@ def tradeoff(
     budget: Annotated[
         float,
         typer.Option(
-            parser=seconds, metavar="TIME", help="Time limit for each run. Runs that reach it are marked."
+            parser=seconds,
+            metavar="TIME",
+            help=f"Time limit for each run. Runs that reach it are marked. Default: {LONGEST_S:g}s.",
+            show_default=False,
         ),
     ] = LONGEST_S,
     tile: TileOption = None,
@@ -184,6 +187,7 @@ def _measure(
                     dtype=dtype,  # type: ignore[arg-type]  # checked in `tradeoff`
                 )
             runs.append(replace(run, case=case.name, repeat=repeat))
+            # The page shows frames of one repeat; a view of them would keep the whole truth in memory.
             if repeat == 0:
                 true = judge.truth(voxels)
                 truths[case.name, voxels] = None if true is None else true[judge.picked(voxels)].copy()

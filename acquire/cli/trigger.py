@@ -68,7 +68,10 @@ def info(
 def load(
     file: Annotated[
         Path,
-        typer.Argument(help="File with the code: text of 0 and 1 (white space is ignored), or a .npy array."),
+        typer.Argument(
+            metavar="FILE",
+            help="File with the code: text of 0 and 1 (white space is ignored), or a .npy array.",
+        ),
     ],
     config: ConfigOption = "rig-demo",
     url: UrlOption = None,
@@ -86,6 +89,7 @@ def load(
         crc = device.load_code(bits)
         facts = {"bits": len(bits), "ones": int(bits.sum()), "crc": f"{crc:#010x}"}
         facts["load_ms"] = round((time.monotonic() - begun_s) * 1000, 1)
+        # The device's CRC has covered its memory, but not what a host reads from it.
         if (device.read_code(len(bits)) != bits).any():
             raise TriggerError("the code memory reads back differently from what was loaded")
     if json:
@@ -227,6 +231,7 @@ def _watch(device: Device, seconds: float | None) -> Iterator[TagRecord]:
             yield tag
             if tag.flags & TagFlag.LAST:
                 return
+        # Any valid request resets the watchdog, also while no tags come.
         device.status()
 
 
@@ -236,9 +241,11 @@ def _read_code(file: Path) -> NDArray[np.uint8]:
 
     try:
         if file.suffix == ".npy":
+            # A pickle could run any code.
             bits = np.asarray(np.load(file, allow_pickle=False))
         else:
             text = "".join(file.read_text(encoding="ascii").split())
+            # Characters below "0" wrap around to large numbers, which are refused below.
             bits = np.frombuffer(text.encode(), np.uint8) - ord("0")
     except (OSError, ValueError) as error:
         raise UsageError(f"{file} cannot be read as a code: {error}") from error

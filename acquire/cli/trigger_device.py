@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 ConfigOption = Annotated[
     str,
     typer.Option(
-        "--config", "-c", metavar="FILE", autocompletion=rigs, help="Rig file, or the name of a built-in rig."
+        "--config", "-c", metavar="RIG", autocompletion=rigs, help="Rig file, or the name of a built-in rig."
     ),
 ]
 UrlOption = Annotated[

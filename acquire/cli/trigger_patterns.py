@@ -125,6 +125,7 @@ def _run(
             _wait(driver, stop_requested, seconds)
             counted = {key: value for key, value in driver.statistics().items() if key.startswith("strobe")}
         finally:
+            # Also after an error: the light must not stay on.
             lines = driver.stop()
     if json:
         print_json(facts | {"lines": lines} | counted)

@@ -49,6 +49,7 @@ def _display(*, as_json: bool) -> Iterator[Callable[[Any], None]]:
                 say(json_text({"error": status.to_dict()} if ended else status))
             else:
                 say(f"{time.strftime('%H:%M:%S')} {status.message if ended else status_line(status)}")
+            # In a pipe the line would otherwise wait until a buffer is full.
             sys.stdout.flush()
 
         yield write
@@ -58,6 +59,7 @@ def _display(*, as_json: bool) -> Iterator[Callable[[Any], None]]:
     from rich.text import Text
 
     # Refreshed by `draw` alone, at the user's interval.
+    # Visible: rich would otherwise cut a status that is longer than the terminal.
     with Live(console=Console(), auto_refresh=False, vertical_overflow="visible") as live:
 
         def draw(status: Any) -> None:

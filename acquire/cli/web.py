@@ -24,7 +24,7 @@ def web(
         typer.Option(
             "--config",
             "-c",
-            metavar="FILE",
+            metavar="RIG",
             autocompletion=rigs,
             help="Rig file with the [web] settings. Default: built-in settings.",
         ),

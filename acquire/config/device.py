@@ -72,6 +72,7 @@ class TriggerConfig(FrozenModel):
     )
     serial: str = Field(default="", description="driver 'usb': serial number; absent: any")
     clock_hz: int = Field(default=90_000_000, ge=1_000_000, le=1_000_000_000)
+    # 5 is the least of our gateware: the bit of a loaded code comes four clocks after its index.
     substep_ticks: int = Field(default=900, ge=5, lt=2**24, description="duration of a sub-step in ticks")
     tag_every_lines: int = Field(default=256, ge=1, le=65536)
     line_start: Literal["per-line", "per-substep"] = Field(
@@ -127,6 +128,7 @@ class TriggerConfig(FrozenModel):
 
     @model_validator(mode="after")
     def _port_known(self) -> TriggerConfig:
+        # A board on USB is found by its vendor and product; a serial port by nothing but its name.
         if self.driver == "serial" and not self.url:
             raise ValueError("driver 'serial' needs a url, such as /dev/ttyUSB0 or socket://host:port")
         return self
@@ -186,6 +188,7 @@ class CameraConfig(FrozenModel):
 
     @model_validator(mode="after")
     def _noise_whole(self) -> CameraConfig:
+        # Noise in DN is a product of both: one alone predicts nothing.
         if (self.dn_per_electron is None) != (self.read_noise_e is None):
             raise ValueError("dn_per_electron and read_noise_e must be given together, or not at all")
         return self

@@ -82,8 +82,15 @@ def load_rig(
     path = find(name, kind="rig")
     table = _read(path)
     _check_kind(table, "rig", path)
-    for key, value in _pairs(overrides):
-        _set(table, key, value)
+    for dotted, value in _pairs(overrides):
+        *parents, last = dotted.split(".")
+        inner = table
+        for key in parents:
+            # A setting may belong to a table that the file leaves out.
+            inner = inner.setdefault(key, {})
+            if not isinstance(inner, dict):
+                raise ConfigError(f"setting {dotted!r} cannot be set: {key!r} is a value and not a table")
+        inner[last] = value
     rig = _validate(RigConfig, table, path)
     if (named := rig.calibration) is not None:
         # Relative to the working directory, as on a command line, or else to the file.
@@ -203,16 +210,6 @@ def _check_kind(table: dict[str, Any], wanted: str, path: Path) -> None:
             possible=f"a {wanted} file",
             hint=_USES[found[0]].format(path.stem if path.parent == builtin_directory() else path),
         )
-
-
-def _set(table: dict[str, Any], dotted: str, value: Any) -> None:
-    *parents, last = dotted.split(".")
-    for key in parents:
-        # A setting may belong to a table that the file leaves out.
-        table = table.setdefault(key, {})
-        if not isinstance(table, dict):
-            raise ConfigError(f"setting {dotted!r} cannot be set: {key!r} is a value and not a table")
-    table[last] = value
 
 
 def _validate(

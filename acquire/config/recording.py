@@ -67,6 +67,8 @@ class RecordingConfig(FrozenModel):
         le=2**20,
         description="lines per chunk; absent: at most 2 MiB and a tenth of a second",
     )
+    # The index of 255 chunks fits one page. 240 has twenty divisors: chunks of tags, of which a shard holds
+    # a whole number, can have nearly any length.
     shard_chunks: int = Field(default=240, ge=1, le=255, description="chunks per file")
     codec: Literal["none", "lz4", "zstd", "auto"] = Field(
         default="none",

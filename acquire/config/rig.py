@@ -45,6 +45,7 @@ class GeometryConfig(FrozenModel):
     """The sensor in the forward model."""
 
     stages: int = Field(ge=1, le=4096, description="M, TDI stages; without a fibre also the pixels per line")
+    # A recording keeps a line's code bits in one byte.
     substeps: int = Field(ge=1, le=8, description="S, charge-transfer steps per line")
 
     def segment(self, lines: int) -> Geometry:

@@ -164,6 +164,7 @@ class SceneBase(FrozenModel):
     @model_validator(mode="after")
     def _effects_differ(self) -> SceneBase:
         kinds = [effect.kind for effect in self.effects]
+        # The random stream of an effect is that of its kind: a second one would repeat its draws.
         if len(set(kinds)) < len(kinds):
             raise ValueError(f"each effect can be listed only once, not {', '.join(kinds)}")
         return self

@@ -17,7 +17,6 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
     from pathlib import Path
 
-    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
     from acquire.calibrate.calibration import Calibration
@@ -64,27 +63,23 @@ def _columns(known: Calibration) -> Figure | None:
     figure = canvas(1.9 * len(panels) + 0.4)
     axes = figure.subplots(len(panels), 1, squeeze=False, sharex=True).ravel()
     for ax, (key, label) in zip(axes, panels, strict=True):
-        _panel(ax, known, key)
+        measured = known.quantities[key]
+        usable = np.ones(measured.value.shape, np.bool_) if known.usable is None else known.usable
+        hidden = known.steps.get("flat", {}).get("optics_hide_columns", {}) if key == "gain" else {}
+        x = np.arange(measured.value.shape[1])
+        # there are more colours than arms
+        for arm, value, error, good, colour in zip(
+            ARMS, measured.value, measured.uncertainty, usable, SOLVER_COLOURS, strict=False
+        ):
+            shown = np.where(np.isin(x, hidden.get(arm, [])) | ~good, np.nan, value)
+            ax.fill_between(x, shown - 2 * error, shown + 2 * error, color=colour, alpha=0.25, lw=0)
+            ax.plot(x, shown, ".-", color=colour, lw=1, ms=3, label=f"camera {arm.upper()}")
+            ax.plot(x[~good], value[~good], "x", color=MASKED, ms=6)
         ax.set_ylabel(label)
     axes[-1].set_xlabel("column")
     handles, labels = axes[0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside upper right", ncols=3)
     return figure
-
-
-def _panel(ax: Axes, known: Calibration, key: str) -> None:
-    measured = known.quantities[key]
-    usable = np.ones(measured.value.shape, np.bool_) if known.usable is None else known.usable
-    hidden = known.steps.get("flat", {}).get("optics_hide_columns", {}) if key == "gain" else {}
-    x = np.arange(measured.value.shape[1])
-    # there are more colours than arms
-    for arm, value, error, good, colour in zip(
-        ARMS, measured.value, measured.uncertainty, usable, SOLVER_COLOURS, strict=False
-    ):
-        shown = np.where(np.isin(x, hidden.get(arm, [])) | ~good, np.nan, value)
-        ax.fill_between(x, shown - 2 * error, shown + 2 * error, color=colour, alpha=0.25, lw=0)
-        ax.plot(x, shown, ".-", color=colour, lw=1, ms=3, label=f"camera {arm.upper()}")
-        ax.plot(x[~good], value[~good], "x", color=MASKED, ms=6)
 
 
 def _curve(known: Calibration) -> Figure | None:

@@ -132,8 +132,12 @@ def fit_sine(
     if frequency_hz is None and np.ptp(values) <= CONSTANT_SWING * np.abs(values).max():
         return fit_constant(values)
     if frequency_hz is None:
-        start = _spectrum_peak(values, interval_s) if guess_hz is None else guess_hz
-        frequency_hz, harmonics = _refine(values, times_s, start, harmonics)
+        if guess_hz is None:
+            size = SPECTRUM_PADDING * len(values)
+            spectrum = np.abs(np.fft.rfft(values - values.mean(), size))
+            # Without its ends: no sinusoid of frequency 0, or of half the sampling rate, can be fitted.
+            guess_hz = (1 + int(np.argmax(spectrum[1:-1]))) / (size * interval_s)
+        frequency_hz, harmonics = _refine(values, times_s, guess_hz, harmonics)
     else:
         harmonics = _visible_harmonics(frequency_hz, interval_s, harmonics)
     coefficients, residual = _project(values, times_s, frequency_hz, harmonics)
@@ -170,6 +174,8 @@ def compare_curve(
             f"a curve {measured.shape} cannot be compared with a theory {theory.shape}",
             possible="curves of the same length",
         )
+    # a constant has no correlation: numpy would divide 0 by 0
+    swing = all(np.ptp(curve) > CONSTANT_SWING * np.abs(curve).max() for curve in (theory, measured))
     # theory decides whether a curve changes: noise alone always fits some sinusoid
     theory_fit = fit_sine(theory, interval_s, harmonics=harmonics)
     check_finite(measured, "the measured curve")
@@ -179,7 +185,7 @@ def compare_curve(
         measured=fit_sine(measured, interval_s, harmonics=harmonics)
         if theory_fit.amplitude
         else fit_constant(measured),
-        correlation=_correlation(theory, measured),
+        correlation=float(np.corrcoef(theory, measured)[0, 1]) if swing else None,
         level_ratio=float(measured.mean() / theory.mean()) if theory.mean() else None,
         rms_error=float(np.sqrt(np.mean(np.square(measured - theory)))),
     )
@@ -198,14 +204,6 @@ def _check_curve(values: NDArray[np.float64], interval_s: float, harmonics: int)
             f"the sampling interval cannot be {interval_s} s", possible="a positive number of seconds"
         )
     check_finite(values, "the curve")
-
-
-def _spectrum_peak(values: NDArray[np.float64], interval_s: float) -> float:
-    size = SPECTRUM_PADDING * len(values)
-    spectrum = np.abs(np.fft.rfft(values - values.mean(), size))
-    # Without its ends: no sinusoid of frequency 0, or of half the sampling rate, can be fitted.
-    peak = 1 + int(np.argmax(spectrum[1:-1]))
-    return peak / (size * interval_s)
 
 
 def _visible_harmonics(frequency_hz: float, interval_s: float, harmonics: int) -> int:
@@ -257,10 +255,3 @@ def _project(
     design = np.stack(columns, axis=1)
     coefficients = np.linalg.lstsq(design, values, rcond=None)[0].astype(np.float64, copy=False)
     return coefficients, values - design @ coefficients
-
-
-def _correlation(theory: NDArray[np.float64], measured: NDArray[np.float64]) -> float | None:
-    for curve in (theory, measured):
-        if np.ptp(curve) <= CONSTANT_SWING * np.abs(curve).max():
-            return None
-    return float(np.corrcoef(theory, measured)[0, 1])

@@ -54,6 +54,7 @@ def error_of_regions(file: VideoFile, frames: range) -> NDArray[np.float64]:
     assert stored is not None
     found = stored.astype(np.float64)
     known = np.isfinite(found)
+    # A region whose error is known in no frame divides 0 by 0, and is NaN as promised.
     with np.errstate(invalid="ignore", divide="ignore"):
         squares = np.where(known, found, 0) ** 2
         return np.asarray(np.sqrt(squares.sum(0) / known.sum(0)))

@@ -118,9 +118,14 @@ def intensity_curves(result: DemoResult) -> Figure:
     """
     figure = canvas(0.7 + 1.45 * len(result.regions))
     axes = figure.subplots(len(result.regions), 3, squeeze=False, width_ratios=[1, 4.6, 2.1])
+    first, last = result.frame_ms[0], result.frame_ms[-1]
     for row, (where, whole, detail) in enumerate(axes):
-        window = _detail_window(result, row)
-        region = result.regions[row]
+        region, curve = result.regions[row], result.solvers[0].curves[row]
+        # a few periods around the middle of the video; of what does not blink, a share of it
+        share_ms = DETAIL_SHARE * (last - first)
+        wanted_ms = share_ms if curve.constant else DETAIL_PERIODS * 1e3 / curve.theory.frequency_hz
+        half = min(wanted_ms, last - first) / 2
+        window = (first + last) / 2 - half, (first + last) / 2 + half
         where.imshow(result.truth.mean(axis=0), cmap="gray", vmin=0)
         if not region.mask.all():  # a region without an edge has no contour
             where.contour(region.mask, levels=[0.5], colors=HIGHLIGHT, linewidths=1.2)
@@ -128,13 +133,18 @@ def intensity_curves(result: DemoResult) -> Figure:
         bare(where)
         _plot_curves(whole, result, row)
         whole.axvspan(*window, color=HIGHLIGHT, alpha=0.2, lw=0)
-        whole.set(xlim=(result.frame_ms[0], result.frame_ms[-1]), ylabel="intensity")
+        whole.set(xlim=(first, last), ylabel="intensity")
         whole.tick_params(labelbottom=row == len(axes) - 1)
         _plot_curves(detail, result, row)
         detail.set_xlim(*window)
         detail.tick_params(labelleft=False)
         detail.xaxis.set_major_locator(MaxNLocator(2))
-        _list_fits(detail, result, row)
+        set_text = "constant" if region.set_hz is None else f"set {region.set_hz:.0f} Hz"
+        texts = [(set_text, INK)]
+        texts += [(_fit_text(solver.curves[row]), colour) for solver, colour in _coloured(result)]
+        for i, (text, colour) in enumerate(texts):
+            y = 0.5 + 0.22 * ((len(texts) - 1) / 2 - i)
+            detail.text(1.05, y, text, color=colour, fontsize=9, va="center", transform=detail.transAxes)
     axes[0, 2].set_title("detail")
     figure.supxlabel("time since start (ms)", fontsize=9.5)
     handles, labels = axes[0, 1].get_legend_handles_labels()
@@ -168,16 +178,6 @@ def representative_frames(result: DemoResult, count: int = FRAME_COLUMNS) -> NDA
     return first + (np.arange(count) * period) // count
 
 
-def _detail_window(result: DemoResult, row: int) -> tuple[float, float]:
-    """Return the limits of a few periods of this region around the middle of the video, in ms."""
-    first, last = result.frame_ms[0], result.frame_ms[-1]
-    curve = result.solvers[0].curves[row]
-    share_ms = DETAIL_SHARE * (last - first)
-    wanted_ms = share_ms if curve.constant else DETAIL_PERIODS * 1e3 / curve.theory.frequency_hz
-    half = min(wanted_ms, last - first) / 2
-    return (first + last) / 2 - half, (first + last) / 2 + half
-
-
 def _colour_bar(figure: Figure, row: NDArray[Any], label: str, extend: str) -> None:
     image = row[-1].get_images()[0]
     figure.colorbar(image, ax=list(row), label=label, extend=extend, pad=0.01, aspect=11, shrink=0.9)
@@ -193,16 +193,6 @@ def _plot_curves(ax: Axes, result: DemoResult, row: int) -> None:
         # the default solver comes first in the legend and is drawn on top
         ax.plot(result.frame_ms, measured, color=colour, lw=1.0, label=solver.label, zorder=3 - 0.1 * rank)
     ax.set_ylim(min(0.0, ax.get_ylim()[0]), max(1.05, ax.get_ylim()[1]))
-
-
-def _list_fits(ax: Axes, result: DemoResult, row: int) -> None:
-    """Write the set frequency to the right of the axes, and each solver's fit below it in its colour."""
-    set_hz = result.regions[row].set_hz
-    texts = [("constant" if set_hz is None else f"set {set_hz:.0f} Hz", INK)]
-    texts += [(_fit_text(solver.curves[row]), colour) for solver, colour in _coloured(result)]
-    for i, (text, colour) in enumerate(texts):
-        y = 0.5 + 0.22 * ((len(texts) - 1) / 2 - i)
-        ax.text(1.05, y, text, color=colour, fontsize=9, va="center", transform=ax.transAxes)
 
 
 def _fit_text(curve: CurveComparison) -> str:

@@ -41,10 +41,12 @@ class HostWatch:
     def look(self) -> None:
         """Take a sample, which occupies a core for a few hundredths of a second."""
         self._loads.append(os.getloadavg()[0])
+        # The load average counts the last minute, this what a thread gets at this moment.
         self._shares.append(1 / slowness())
 
     def busyness(self) -> Busyness:
         """Summarise the samples; take one now if there are none yet."""
         if not self._loads:
             self.look()
+        # The least share as well: a median hides a neighbour that was busy during one measurement.
         return Busyness(usable_cores(), fmean(self._loads), median(self._shares), min(self._shares))

@@ -20,6 +20,7 @@ def fill_template(template: str, facts: Mapping[str, Any], drawings: Mapping[str
     """Fill one of our templates; the drawings become ``images`` of the same names."""
     environment = jinja2.Environment(
         loader=jinja2.PackageLoader("acquire.evaluate"),
+        # titles and marks are other people's text
         autoescape=True,
         # a misspelt fact is an error, not a blank
         undefined=jinja2.StrictUndefined,

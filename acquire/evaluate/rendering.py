@@ -158,6 +158,7 @@ def grey(frame: NDArray[Any], peak: float, height_px: int) -> Image.Image:
     # NaN, as in tiles that were not reached, has no grey value
     values = np.clip(np.rint(np.nan_to_num(frame) * (255 / peak)), 0, 255).astype(np.uint8)
     enlarge = height_px >= 3 * rows
+    # A reduced picture must not leave out pixels, as the nearest would.
     resample = Image.Resampling.NEAREST if enlarge else Image.Resampling.LANCZOS
     width = round(height_px * columns / rows)  # made even, as the codec of MP4 needs it
     return Image.fromarray(values).resize((width + width % 2, height_px), resample)

@@ -174,6 +174,7 @@ class DemoResult:
 
     def __post_init__(self) -> None:
         frames = len(self.frame_time_ns)
+        # The interval of the frames, a fact of the report, takes two.
         if self.truth.ndim != 3 or self.truth.shape[0] != frames or frames < 2:
             raise UsageError(
                 f"a report cannot have a truth {self.truth.shape} with {frames} time stamps",

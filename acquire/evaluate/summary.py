@@ -109,6 +109,7 @@ def solver_summary(solver: SolverResult, set_hz: list[float | None]) -> dict[str
         "seconds": rounded(solver.seconds, 2),
         "iterations": solver.iterations,
         "requested_iterations": solver.requested_iterations,
+        # With all of its iterations, a solver has not been stopped, however small the budget.
         "stopped_by_budget_s": solver.budget_s if solver.iterations < solver.requested_iterations else None,
         "psnr_db": rounded(solver.psnr_db, 2),
         "worst_frame_psnr_db": rounded(solver.psnr_per_frame.min(), 2),

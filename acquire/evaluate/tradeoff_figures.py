@@ -85,7 +85,15 @@ def curves(runs: Sequence[Run], metric: Metric, clock: Clock) -> Figure:
             _curve(ax, repeats, metric, clock, SOLVER_COLOURS[solvers.index(series[0]) % len(SOLVER_COLOURS)])
         if metric is DECIBELS and (mean_db := yardstick(runs)) is not None:
             ax.axhline(mean_db, color=SOFT, lw=1.2, ls=(0, (1, 1.5)), zorder=1, label="the truth's mean")
-        _time_axis(ax, CLOCKS[clock])
+        ax.set_xscale("log")
+        low, high = ax.get_xlim()
+        # the middle of a logarithmic axis
+        middle, octaves = np.sqrt(low * high), max(float(np.log2(high / low)), LEAST_OCTAVES)
+        ax.set(xlim=(middle / 2 ** (octaves / 2), middle * 2 ** (octaves / 2)), xlabel=CLOCKS[clock])
+        marks = (1, 2, 5) if octaves > MANY_OCTAVES else (1, 1.5, 2, 3, 5, 7)
+        ax.xaxis.set_major_locator(LogLocator(subs=marks))
+        ax.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+        ax.xaxis.set_minor_formatter(NullFormatter())
         _value_axis(ax, metric)
         # Empty lines for the legend: a solver has many curves and markers, and one entry.
         for line, solver in zip(SOLVER_COLOURS, solvers, strict=False):
@@ -120,17 +128,6 @@ def _curve(ax: Axes, repeats: list[Run], metric: Metric, clock: Clock, colour: s
 def _shown(values: NDArray[np.float64], metric: Metric) -> NDArray[np.float64]:
     scaled = values * metric.scale
     return scaled if metric.floor is None else np.maximum(scaled, metric.floor)
-
-
-def _time_axis(ax: Axes, label: str) -> None:
-    ax.set_xscale("log")
-    low, high = ax.get_xlim()
-    # the middle of a logarithmic axis
-    middle, octaves = np.sqrt(low * high), max(float(np.log2(high / low)), LEAST_OCTAVES)
-    ax.set(xlim=(middle / 2 ** (octaves / 2), middle * 2 ** (octaves / 2)), xlabel=label)
-    ax.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5) if octaves > MANY_OCTAVES else (1, 1.5, 2, 3, 5, 7)))
-    ax.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
-    ax.xaxis.set_minor_formatter(NullFormatter())
 
 
 def _value_axis(ax: Axes, metric: Metric) -> None:

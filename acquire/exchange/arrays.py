@@ -30,6 +30,7 @@ def write_npz(path: Path, content: Content, advance: Callable[[int], object]) ->
             with archive.open(f"{array.name}.npy", "w", force_zip64=True) as file:
                 _write(file, array, advance)
         with archive.open("facts.npy", "w") as file:
+            # A text, and not an object: NumPy reads no pickles unless it is told to.
             npy.write_array(file, np.array(json.dumps(content.facts)), allow_pickle=False)
 
 

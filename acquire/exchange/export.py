@@ -44,6 +44,7 @@ def format_for(path: Path) -> str:
     raise UsageError(
         f"the format of {path} cannot be taken from its name",
         possible=".tif (ImageJ), .ome.tif, .h5 or .nxs (NeXus), .npy, .npz, .mp4",
+        # pathlib has no suffix for a name that is only a dot
         hint=f"{path.with_suffix('.h5')}" if path.name.strip(".") else "",
     )
 

@@ -244,7 +244,13 @@ def _numpy(path: Path, _: Layout, __: ExitStack) -> LineFile:
 def _hdf5(path: Path, layout: Layout, held: ExitStack) -> LineFile:
     h5py = library("h5py", "export", "an HDF5 file")
     file = held.enter_context(h5py.File(path, "r"))
-    there = _datasets(file, h5py)
+    there: list[str] = []
+
+    def visit(name: str, node: Any) -> None:
+        if isinstance(node, h5py.Dataset) and node.ndim in {2, 3} and node.dtype.name in TYPES:
+            there.append(f"/{name}")
+
+    file.visititems(visit)
     if layout.dataset is None:
         # In our own exports the flags, which are also uint16 with two axes, are next to the lines.
         found = [name for name in there if not name.endswith("/flags")]
@@ -268,18 +274,6 @@ def _hdf5(path: Path, layout: Layout, held: ExitStack) -> LineFile:
     )
 
 
-def _datasets(file: Any, h5py: Any) -> list[str]:
-    """Return the paths of the arrays that can be lines."""
-    found: list[str] = []
-
-    def visit(name: str, node: Any) -> None:
-        if isinstance(node, h5py.Dataset) and node.ndim in {2, 3} and node.dtype.name in TYPES:
-            found.append(f"/{name}")
-
-    file.visititems(visit)
-    return found
-
-
 def _raw(path: Path, layout: Layout, _: ExitStack) -> LineFile:
     if layout.dtype is None or layout.pixels is None:
         raise UsageError(
@@ -295,6 +289,7 @@ def _raw(path: Path, layout: Layout, _: ExitStack) -> LineFile:
     size, line_bytes = there - layout.skip_bytes, dtype.itemsize * pixels
     if pixels < 1 or size < line_bytes:
         raise UsageError(f"{path} has {size} bytes of pixels", possible=f"{line_bytes} bytes for every line")
+    # Refused, and not cut off: with a wrong width every line is displaced against the one before.
     if size % line_bytes:
         raise UsageError(
             f"{path}: {size} bytes are not a whole number of lines of {pixels} pixels {dtype.name}",

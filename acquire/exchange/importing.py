@@ -239,14 +239,6 @@ def _unknown(arms: Mapping[str, Arm], instrument: Instrument) -> list[str]:
     return found
 
 
-def _cameras(instrument: Instrument, dtype: np.dtype[Any]) -> dict[str, Any]:
-    usual = {"white_dn": float(np.iinfo(dtype).max), "black_level_dn": 0.0, "responsivity_dn": 1.0}
-    return {
-        arm: {**usual, **instrument.cameras.get(arm, {}), "model": "another program's, imported"}
-        for arm in ARMS
-    }
-
-
 def _clock(instrument: Instrument) -> ClockFit:
     """Return a clock whose tick 0 is placed so that the first line is read out at the given time."""
     geometry = Geometry(instrument.stages, instrument.substeps, 1)
@@ -266,6 +258,7 @@ def _spec(
         usual_chunk_lines(file.pixels * dtype.itemsize, instrument.line_rate_hz),
         1 << max(4, lines.bit_length()),
     )
+    usual = {"white_dn": float(np.iinfo(dtype).max), "black_level_dn": 0.0, "responsivity_dn": 1.0}
     return RecordingSpec(
         run_id=run_id,
         stages=instrument.stages,
@@ -277,7 +270,10 @@ def _spec(
         code=shifted(instrument.code, instrument.code_start).to_attrs(),
         substep_ticks=instrument.substep_ticks,
         trigger={"model": "none: the lines are imported"},
-        cameras=_cameras(instrument, dtype),
+        cameras={
+            arm: {**usual, **instrument.cameras.get(arm, {}), "model": "another program's, imported"}
+            for arm in ARMS
+        },
         config=dict(instrument.config or {}),
         extra={
             "imported": {
@@ -315,20 +311,16 @@ def _write(
         stop = min(lines, start + BLOCK_LINES)
         for arm in ARMS:
             # The arms in turn, since both have to be on the disk for a commit.
-            block = _block(arms.get(arm), arm, spec, start, stop)
-            writer.append(tagger.tag(block))
+            source = arms.get(arm)
+            if source is None:  # both arms of a recording have the same rows
+                pixels: NDArray[Any] = np.zeros((stop - start, spec.pixels), spec.line_dtype)
+                flags = np.full(stop - start, LineFlag.MISSING, np.uint16)
+            else:
+                pixels = np.ascontiguousarray(source.file.rows(source.number, start, stop))
+                full = (pixels >= spec.cameras[arm]["white_dn"]).any(axis=1)
+                flags = np.where(full, LineFlag.SATURATED, 0).astype(np.uint16)
+            writer.append(tagger.tag(LineBlock(arm, spec.first_line + start, pixels, flags)))
         if number % COMMIT_BLOCKS == 0:
             writer.commit()
         if progress is not None:
             progress(stop, lines)
-
-
-def _block(source: Arm | None, arm: str, spec: RecordingSpec, start: int, stop: int) -> LineBlock:
-    first = spec.first_line + start
-    if source is None:  # both arms of a recording have the same rows
-        pixels: NDArray[Any] = np.zeros((stop - start, spec.pixels), spec.line_dtype)
-        flags = np.full(stop - start, LineFlag.MISSING, np.uint16)
-        return LineBlock(arm, first, pixels, flags)
-    pixels = np.ascontiguousarray(source.file.rows(source.number, start, stop))
-    full = (pixels >= spec.cameras[arm]["white_dn"]).any(axis=1)
-    return LineBlock(arm, first, pixels, np.where(full, LineFlag.SATURATED, 0).astype(np.uint16))

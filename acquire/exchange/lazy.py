@@ -67,6 +67,7 @@ class Stack:
         return found[(slice(None), *rest)]
 
     def __array__(self, dtype: Any = None, copy: bool | None = None) -> NDArray[Any]:
+        # NumPy 2 passes `copy`; pictures are read anew in any case.
         return np.asarray(self[:], dtype)
 
 

@@ -18,7 +18,7 @@ from acquire.store import format_of, open_recording, open_video
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from acquire.store import Recording, VideoFile
+    from acquire.store import Recording
 
 Layer = tuple[Any, dict[str, Any], str]
 SAMPLED = 5
@@ -48,11 +48,14 @@ def read_video(path: Any) -> list[Layer]:
     reason = "not known which frames are trusted" if trusted is None else "no frame is trusted"
     name = f"{_name(path)} ({f'frames {kept.start} to {kept.stop - 1}' if trusted else reason})"
     step, origin = file.scale, file.origin
+    # older videos have no channel, and no window of black and white in it
+    channels = file.attrs["ome"].get("omero", {}).get("channels", ())
+    windows = [(float(each["window"]["start"]), float(each["window"]["end"])) for each in channels]
     options = {
         "name": name,
         "scale": list(step),
         "translate": [origin[0] + step[0] * kept.start, *origin[1:]],
-        "contrast_limits": _window(file),
+        "contrast_limits": windows[0] if windows else _limits(frames(file, range(len(file.time_ns)))),
         "multiscale": False,
         "rgb": False,
         "metadata": {
@@ -69,7 +72,23 @@ def read_recording(path: Any) -> list[Layer]:
     The overview is hidden at first; it shows the whole recording at once.
     """
     recording = open_recording(str(path))
-    arms = [_arm(recording, arm, number) for number, arm in enumerate(ARMS)]
+    arms: list[Layer] = []
+    for number, arm in enumerate(ARMS):
+        stack = pages(recording, arm)
+        # `rgb` and `multiscale` are stated, since napari would guess them from the shape.
+        options = {
+            "name": f"{_name(recording)}, arm {arm}",
+            "translate": [0, 0, number * (stack.shape[2] + GAP)],
+            "contrast_limits": _limits(stack),
+            "multiscale": False,
+            "rgb": False,
+            "metadata": {
+                "first_line": recording.first_line,
+                "lines_of_a_page": PAGE_LINES,
+                **recording.info(),
+            },
+        }
+        arms.append((stack, options, "image"))
     overviews = [_overview(recording, arm, layer) for arm, layer in zip(ARMS, arms, strict=True)]
     return [*(layer for layer in overviews if layer is not None), *arms]
 
@@ -92,31 +111,8 @@ def _overview(recording: Recording, arm: str, lines: Layer) -> Layer | None:
     return found.rows, options, "image"
 
 
-def _arm(recording: Recording, arm: str, number: int) -> Layer:
-    stack = pages(recording, arm)
-    # `rgb` and `multiscale` are stated, since napari would guess them from the shape.
-    options = {
-        "name": f"{_name(recording)}, arm {arm}",
-        "translate": [0, 0, number * (stack.shape[2] + GAP)],
-        "contrast_limits": _limits(stack),
-        "multiscale": False,
-        "rgb": False,
-        "metadata": {"first_line": recording.first_line, "lines_of_a_page": PAGE_LINES, **recording.info()},
-    }
-    return stack, options, "image"
-
-
 def _name(path: object) -> str:
     return str(path).rstrip("/").rpartition("/")[2].removesuffix(".zarr")
-
-
-def _window(file: VideoFile) -> tuple[float, float]:
-    """Return the black and white levels recorded in the video; for an older one, from some of its frames."""
-    channels = file.attrs["ome"].get("omero", {}).get("channels", ())
-    # there is one channel, and in older videos none
-    for channel in channels:
-        return float(channel["window"]["start"]), float(channel["window"]["end"])
-    return _limits(frames(file, range(len(file.time_ns))))
 
 
 def _limits(stack: Stack) -> tuple[float, float]:

@@ -55,14 +55,25 @@ class SideBySide:
             part.arm_like(first)
 
     def next_block(self, timeout_s: float) -> CameraBlock | None:
-        """Return the next lines that every part has delivered."""
+        """Return the next lines that every part has delivered, side by side."""
         while (blocks := self._blocks(timeout_s)) is not None:
             # a part that lost lines has blocks that begin and end elsewhere
             first = max(block.first_line for block in blocks)
             end = min(block.first_line + len(block.flags) for block in blocks)
-            self._waiting = [_from(block, end) for block in blocks]
+            for number, block in enumerate(blocks):
+                skip = max(0, end - block.first_line)
+                rest = CameraBlock(block.first_line + skip, block.pixels[skip:], block.flags[skip:])
+                self._waiting[number] = rest if len(rest.flags) else None
             if first < end:
-                return self._joined(blocks, first, end - first)
+                self._delivered += end - first
+                pixels: NDArray[Any] = np.zeros((end - first, self._opener.width), blocks[0].pixels.dtype)
+                flags = np.zeros(end - first, np.uint16)
+                for column, block in zip(self._opener.first_columns, blocks, strict=True):
+                    part = slice(first - block.first_line, end - block.first_line)
+                    pixels[:, column : column + block.pixels.shape[1]] = block.pixels[part]
+                    # what is wrong with a line of one image is wrong with the sensor's line
+                    flags |= block.flags[part]
+                return CameraBlock(first, pixels, flags)
         return None
 
     def _blocks(self, timeout_s: float) -> list[CameraBlock] | None:
@@ -73,18 +84,6 @@ class SideBySide:
             if self._waiting[number] is None:
                 return None
         return [block for block in self._waiting if block is not None]
-
-    def _joined(self, blocks: list[CameraBlock], first_line: int, count: int) -> CameraBlock:
-        """Return lines that are in all blocks side by side."""
-        self._delivered += count
-        pixels: NDArray[Any] = np.zeros((count, self._opener.width), blocks[0].pixels.dtype)
-        flags = np.zeros(count, np.uint16)
-        for column, block in zip(self._opener.first_columns, blocks, strict=True):
-            skip = first_line - block.first_line
-            pixels[:, column : column + block.pixels.shape[1]] = block.pixels[skip : skip + count]
-            # what is wrong with a line of one image is wrong with the sensor's line
-            flags |= block.flags[skip : skip + count]
-        return CameraBlock(first_line, pixels, flags)
 
     def times_ns(self, first_line: int, count: int) -> NDArray[np.int64]:
         return self._parts[0].times_ns(first_line, count)
@@ -108,11 +107,3 @@ class SideBySide:
     def close(self) -> None:
         for part in self._parts:
             part.close()
-
-
-def _from(block: CameraBlock, line: int) -> CameraBlock | None:
-    """Return the part of a block from a line on, None if there is none."""
-    skip = max(0, line - block.first_line)
-    if skip >= len(block.flags):
-        return None
-    return CameraBlock(block.first_line + skip, block.pixels[skip:], block.flags[skip:])

@@ -75,7 +75,15 @@ class DigitScene(MaskScene):
         self.segments = [
             (display, name) for display in displays for name in _PLACES if bool(_shows(display, name).any())
         ]
-        self.masks = np.stack([_segment(display, name, size) for display, name in self.segments])
+        masks = []
+        for display, name in self.segments:
+            top, left, height, width = (display.height * length for length in _PLACES[name])
+            top += display.row - display.height / 2
+            left += display.column - display.height * _WIDTH / 2
+            # the fraction of each pixel that the segment covers
+            covered = overlap(size, top, height)[:, None] * overlap(size, left, width)
+            masks.append(covered.astype(np.float32))
+        self.masks = np.stack(masks)
 
     def intensity(self, first: int, count: int, substep_s: float | None = None) -> NDArray[np.float64]:
         """Return the intensity of each of the K segments: (K, count)."""
@@ -108,12 +116,3 @@ def _digit_light(display: DisplayConfig, first: int, count: int, step: float) ->
     )
     mean: NDArray[np.float64] = np.asarray(area) / step
     return mean
-
-
-def _segment(display: DisplayConfig, name: str, size: int) -> NDArray[np.float32]:
-    """Return the fraction of each pixel that the segment covers: (size, size)."""
-    top, left, height, width = (display.height * length for length in _PLACES[name])
-    top += display.row - display.height / 2
-    left += display.column - display.height * _WIDTH / 2
-    covered = overlap(size, top, height)[:, None] * overlap(size, left, width)
-    return covered.astype(np.float32)

@@ -83,23 +83,18 @@ class LedScene(MaskScene):
 
     def intensity(self, first: int, count: int, substep_s: float | None = None) -> NDArray[np.float64]:
         """Return the mean light of each LED over each sub-step: (K, count)."""
-        return np.stack([_light(led, first, count, substep_s or self.substep_s) for led in self.leds])
+        intensities = []
+        for led in self.leds:
+            light = mean_drive(led.drive, first, count, substep_s or self.substep_s)
+            if led.saturation is not None:
+                # a·(1 − exp(−d/a)) for a duty cycle of d: d where it is small, and never more than a. Of the
+                # mean over the sub-step, because the driver smooths the PWM well before it reaches the LED.
+                light = -led.saturation * np.expm1(-light / led.saturation)
+            intensities.append(light)
+        return np.stack(intensities)
 
 
 def _extent(centre: float, side: float, size: int) -> slice:
     """Return the pixels along one axis that a shape may cover, including its smooth edge."""
     first, last = (centre - side / 2) * size, (centre + side / 2) * size
     return slice(max(0, int(first) - _EDGE), min(size, int(last) + 1 + _EDGE))
-
-
-def _light(led: LedConfig, first: int, count: int, substep_s: float) -> NDArray[np.float64]:
-    """Return the light of an LED with duty cycle d: d, or a·(1 − exp(−d/a)) if it saturates at a.
-
-    For small d both are d; the saturating LED never exceeds a and emits (1 − 1/e)·a at d = a. Saturation
-    acts on the mean over the sub-step, because the driver smooths the PWM well before it reaches the LED.
-    """
-    duty = mean_drive(led.drive, first, count, substep_s)
-    if led.saturation is None:
-        return duty
-    light: NDArray[np.float64] = -led.saturation * np.expm1(-duty / led.saturation)
-    return light

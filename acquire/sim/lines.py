@@ -137,25 +137,20 @@ class SeparableLines:
 
     def _compute(self, index: int) -> None:
         if index != self._tile_index:
-            light = self._light(index * TILE_LINES * self._substeps)
-            start = 0
-            for h, rows in zip(light, self._rows, strict=True):
+            S, start = self._substeps, 0
+            # h of every sub-step at which a line of the tile meets a row: the sum of S sub-steps of light
+            count = S * (TILE_LINES - 1) + self._size
+            lit = self._source.light(index * TILE_LINES * S, count + S - 1)
+            light: NDArray[np.float64] = sum(lit[:, u : u + count] for u in range(1, S)) + lit[:, :count]
+            for h, rows in zip(light.astype(np.float32), self._rows, strict=True):
                 width = rows.stop - rows.start
                 # Line i meets row r at sub-step S·i + r: lines are the product of windows of h, S apart, with
                 # the mask.
-                windows = sliding_window_view(h[rows.start :], width)[:: self._substeps]
+                windows = sliding_window_view(h[rows.start :], width)[::S]
                 self._windows[:, start : start + width] = windows[:TILE_LINES]
                 start += width
             np.matmul(self._windows, self._weights, out=self._tile)
             self._tile_index = index
-
-    def _light(self, first: int) -> NDArray[np.float32]:
-        """Return h_k(first + i) for every sub-step i at which a line of a tile meets a row: (K, i)."""
-        S = self._substeps
-        count = S * (TILE_LINES - 1) + self._size
-        lit = self._source.light(first, count + S - 1)
-        h: NDArray[np.float64] = sum(lit[:, u : u + count] for u in range(1, S)) + lit[:, :count]
-        return h.astype(np.float32)
 
 
 class FrameLines:

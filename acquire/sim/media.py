@@ -29,7 +29,6 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from numpy.typing import NDArray
-    from PIL.Image import Image
 
     Light = NDArray[np.floating[Any]]
 
@@ -277,7 +276,12 @@ class _PictureFile:
             image.seek(self.count - 1)
             image.load()
             if "duration" in image.info:
-                self.frame_rate_hz = _mean_rate_hz(image, self.count)
+                total_ms = 0.0
+                for index in range(self.count):
+                    image.seek(index)
+                    image.load()  # some formats state a frame's duration only once it is decoded
+                    total_ms += float(image.info.get("duration") or 0)
+                self.frame_rate_hz = 1000 * self.count / total_ms if total_ms > 0 else None
 
     def frame(self, index: int) -> Light:
         from PIL import Image
@@ -293,16 +297,6 @@ class _PictureFile:
                 return _grey(image.convert("L"))
         except (OSError, SyntaxError, ValueError, EOFError) as error:
             raise DataError(f"{self._path}: frame {index} cannot be read: {error}") from error
-
-
-def _mean_rate_hz(image: Image, count: int) -> float | None:
-    """Return the frames of an animation per second of its duration; None if it states none."""
-    total_ms = 0.0
-    for index in range(count):
-        image.seek(index)
-        image.load()  # some formats state a frame's duration only once it is decoded
-        total_ms += float(image.info.get("duration") or 0)
-    return 1000 * count / total_ms if total_ms > 0 else None
 
 
 def _grey(levels: Any) -> Light:

@@ -99,11 +99,6 @@ class _Sprite:
     def draw(self, frames: NDArray[np.float32], substeps: NDArray[np.int64]) -> None:
         from acquire.sim.kernels import paste  # compiled code, which is not needed to read a scene file
 
-        scale = len(self._picture) / (self._config.size * self._size)
-        paste(frames, self._picture, self._alpha, self._places(substeps), scale, self._reach_texels / scale)
-
-    def _places(self, substeps: NDArray[np.int64]) -> Grid:
-        """Return row and column in pixels, cosine and sine of the heading: (frame, 4)."""
         config = self._config
         # in turns, counter-clockwise; rows count downwards, hence the sign of the sine below
         orbit = self._turns(substeps, config.orbit_hz, config.orbit_phase_deg)
@@ -116,7 +111,9 @@ class _Sprite:
         row = config.row - config.orbit_radius * np.sin(2 * np.pi * orbit)
         column = config.column + config.orbit_radius * np.cos(2 * np.pi * orbit)
         angle = 2 * np.pi * heading
-        return np.stack([row * self._size, column * self._size, np.cos(angle), np.sin(angle)], axis=1)
+        places = np.stack([row * self._size, column * self._size, np.cos(angle), np.sin(angle)], axis=1)
+        scale = len(self._picture) / (config.size * self._size)
+        paste(frames, self._picture, self._alpha, places, scale, self._reach_texels / scale)
 
     def _turns(self, substeps: NDArray[np.int64], rate_hz: float, phase_deg: float) -> Grid:
         turns: Grid = ((substeps + 0.5) * (rate_hz * self._substep_s) + phase_deg / 360) % 1.0

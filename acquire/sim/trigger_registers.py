@@ -106,9 +106,6 @@ class RegisterBank:
             if word or not 0 <= address < r.MAP_END:
                 raise Refusal(ErrorCode.BAD_ADDRESS, address)
             return
-        self._write_register(register, address, word)
-
-    def _write_register(self, register: r.Register, address: int, word: int) -> None:
         if not register.writable:
             raise Refusal(ErrorCode.READ_ONLY, address)
         if register is r.COMMAND:

@@ -34,25 +34,18 @@ def truth(
         )
     side = -(-scene.size // spatial_merge)
     voxels = np.zeros((-(-count // temporal_merge), side, side))
+    starts = np.arange(0, scene.size, spatial_merge)
+    extent = np.diff([*starts, scene.size])
     block = max(1, _BLOCK_BYTES // (4 * scene.size**2))
     for offset in range(0, count, block):
         frames = scene.frames(first_substep + offset, min(block, count - offset))
         voxel = np.arange(offset, offset + len(frames)) // temporal_merge
         begins = np.flatnonzero(np.diff(voxel, prepend=-1))
-        summed = np.add.reduceat(_merge_plane(frames, spatial_merge), begins, axis=0)
+        summed = np.add.reduceat(frames, starts, axis=1, dtype=np.float64)
+        summed = np.add.reduceat(summed, starts, axis=2) / (extent[:, None] * extent)
+        summed = np.add.reduceat(summed, begins, axis=0)
         # Added, because a voxel may begin in one block of frames and end in the next.
         voxels[voxel[0] : voxel[-1] + 1] += summed
     # the last voxel may have fewer sub-steps
     voxels /= np.bincount(np.arange(count) // temporal_merge)[:, None, None]
     return voxels.astype(np.float32)
-
-
-def _merge_plane(frames: NDArray[np.float32], spatial_merge: int) -> NDArray[np.float64]:
-    """Return the mean over blocks of rows and columns."""
-    size = frames.shape[1]
-    starts = np.arange(0, size, spatial_merge)
-    extent = np.diff([*starts, size])
-    summed = np.add.reduceat(frames, starts, axis=1, dtype=np.float64)
-    summed = np.add.reduceat(summed, starts, axis=2)
-    merged: NDArray[np.float64] = summed / (extent[:, None] * extent)
-    return merged

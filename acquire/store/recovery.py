@@ -303,7 +303,13 @@ class _Recoverer:
         attributes = dict(self.recording.attrs)
         lost = {arm: sum(count for _, count, _ in found) for arm, found in new_gaps.items()}
         if self.sealed:
-            attributes["ledger"] = _with_lost(attributes["ledger"], lost)
+            attributes["ledger"] = ledger = copy.deepcopy(attributes["ledger"])
+            for arm, count in lost.items():
+                book = ledger.get(arm)
+                if count and isinstance(book, dict) and "stored" in book:
+                    book["stored"] -= count
+                    missing = book.setdefault("missing", {})
+                    missing["damaged"] = missing.get("damaged", 0) + count
             if any(lost.values()) and attributes["run_condition"] in (
                 RunCondition.GOOD,
                 RunCondition.TAINTED,
@@ -340,15 +346,3 @@ def _joined(
     if gaps and gaps[-1][0] + gaps[-1][1] == first and gaps[-1][2] == cause:
         return [*gaps[:-1], (gaps[-1][0], gaps[-1][1] + count, cause)]
     return [*gaps, (first, count, cause)]
-
-
-def _with_lost(ledger: dict[str, Any], lost: dict[str, int]) -> dict[str, Any]:
-    """Return the ledger of a sealed recording that lost lines afterwards."""
-    changed = copy.deepcopy(ledger)
-    for arm, count in lost.items():
-        book = changed.get(arm)
-        if count and isinstance(book, dict) and "stored" in book:
-            book["stored"] -= count
-            missing = book.setdefault("missing", {})
-            missing["damaged"] = missing.get("damaged", 0) + count
-    return changed

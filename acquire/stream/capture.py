@@ -174,7 +174,14 @@ class Capture:
 
     def _begin(self, timeout_s: float, progress: Callable[[str], object]) -> None:
         progress("memory for the rings")
-        self._make_memory()
+        self._tags = Ring("tags", _TAG_RING)
+        self._counters[RECORDER] = Counters(recorder_plan.COUNTERS)
+        self._counters[TRIGGER] = Counters(TRIGGER_COUNTERS + TAG_READER_COUNTERS)
+        if self._plan.watch is not None:
+            self._counters[WATCHER] = Counters(watcher.COUNTERS)
+        for arm in ARMS:
+            self._rings[arm] = Ring(arm, self._plan.ring_shape)
+            self._counters[arm] = Counters(grabber.COUNTERS)
         # Start all before waiting for any: a camera takes seconds to open.
         self._workers[RECORDER] = self._new_recorder()
         if self._plan.watch is not None:
@@ -193,7 +200,6 @@ class Capture:
         self._trigger.prepare(self._plan.run)
         self.clock = self._trigger.start()
         self._workers[RECORDER].post(RunStarted(self.clock))
-        assert self._tags is not None
         self._supervisor = Supervisor(
             self._trigger,
             self._workers,
@@ -206,16 +212,6 @@ class Capture:
             ),
         )
         self._supervisor.start()
-
-    def _make_memory(self) -> None:
-        self._tags = Ring("tags", _TAG_RING)
-        self._counters[RECORDER] = Counters(recorder_plan.COUNTERS)
-        self._counters[TRIGGER] = Counters(TRIGGER_COUNTERS + TAG_READER_COUNTERS)
-        if self._plan.watch is not None:
-            self._counters[WATCHER] = Counters(watcher.COUNTERS)
-        for arm in ARMS:
-            self._rings[arm] = Ring(arm, self._plan.ring_shape)
-            self._counters[arm] = Counters(grabber.COUNTERS)
 
     def _new_recorder(self) -> Worker:
         plan = self._plan

@@ -238,7 +238,10 @@ class Supervisor:
         try:
             while not self._ending.is_set():
                 begun = self._turned_s = time.monotonic()
-                self._show_turn(begun)
+                # The recorder must not flag lines as untagged because this process was held up.
+                self._hold_ups.update()
+                self._counters[TRIGGER]["held_up_to_ns"] = round(self._hold_ups.over_s * NS_PER_S)
+                self._counters[TRIGGER]["turned_ns"] = round(begun * NS_PER_S)
                 tags = self._take_tags()
                 self._query_trigger(begun)
                 for name, worker in self._workers.items():  # a successor only replaces the value of a key
@@ -257,12 +260,6 @@ class Supervisor:
                     self._ending.wait(max(0.0, begun + _TAG_WAIT_S - time.monotonic()))
         except Exception as error:  # noqa: BLE001 - the outermost boundary of the thread: reported as a fault
             self._fail(f"supervisor: {type(error).__name__}: {error}")
-
-    def _show_turn(self, now_s: float) -> None:
-        """Publish that tags are passed on: lines must not be flagged because this process was held up."""
-        self._hold_ups.update()
-        self._counters[TRIGGER]["held_up_to_ns"] = round(self._hold_ups.over_s * NS_PER_S)
-        self._counters[TRIGGER]["turned_ns"] = round(now_s * NS_PER_S)
 
     def _take_tags(self) -> list[LineTag]:
         if self._trigger_lost:

@@ -136,18 +136,15 @@ class Tagger:
         for start, span in reversed(self._spans.items()):
             if start <= first_line and first_line + count <= start + len(span):
                 return span[first_line - start : first_line - start + count]
-        self._spans[first_line] = span = self._compute(first_line, max(count, _SPAN_LINES))
+        substeps, lines = self._run.substeps, max(count, _SPAN_LINES)
+        first_bit, bits_end = substeps * first_line, substeps * (first_line + lines)
+        code_index = np.arange(first_bit, bits_end, substeps, dtype=np.uint64)
+        tick = (code_index + np.uint64(self._readout_substep)) * np.uint64(self._run.substep_ticks)
+        bits = self._run.code.bits(first_bit, substeps * lines)
+        code = np.zeros(lines, np.uint8)
+        for substep in range(substeps):  # packbits takes several times as long on rows this short
+            code |= bits[substep::substeps] << np.uint8(substep)
+        self._spans[first_line] = span = LineTable(code_index, code, tick, self._clock.time_ns(tick))
         if len(self._spans) > _SPANS_KEPT:
             del self._spans[next(iter(self._spans))]  # the oldest
         return span[:count]
-
-    def _compute(self, first_line: int, count: int) -> LineTable:
-        substeps = self._run.substeps
-        first_bit = substeps * first_line
-        code_index = np.arange(first_bit, first_bit + substeps * count, substeps, dtype=np.uint64)
-        tick = (code_index + np.uint64(self._readout_substep)) * np.uint64(self._run.substep_ticks)
-        bits = self._run.code.bits(first_bit, substeps * count)
-        code = np.zeros(count, np.uint8)
-        for substep in range(substeps):  # packbits takes several times as long on rows this short
-            code |= bits[substep::substeps] << np.uint8(substep)
-        return LineTable(code_index, code, tick, self._clock.time_ns(tick))

@@ -29,5 +29,6 @@ def assert_adjoint(
     assert back.shape == x.shape, f"the transpose returns shape {back.shape} for an x of shape {x.shape}"
     gap = abs(float(np.vdot(image, y)) - float(np.vdot(x, back)))
     scale = float(np.linalg.norm(image) * np.linalg.norm(y))
+    # Of zeros, anything would pass as the transpose.
     assert scale > 0, "the map returns only zeros"
     assert gap <= rtol * scale, f"⟨A·x, y⟩ and ⟨x, Aᵀ·y⟩ differ by {gap / scale:.2g} of ‖A·x‖·‖y‖"

@@ -123,6 +123,7 @@ class CameraContract:
         assert (signal.getsignal(signal.SIGINT), list(warnings.filters)) == before
 
     def test_what_opens_it_can_be_given_to_another_process(self, stand: CameraStand) -> None:
+        # A camera is opened by its grabber, which is a process of its own.
         sent = stand.opener if stand.sent is None else stand.sent
         assert pickle.loads(pickle.dumps(sent)) == sent  # noqa: S301  # our own bytes
 
@@ -135,6 +136,7 @@ def take(camera: Camera, blocks: int) -> list[CameraBlock]:
         assert time.monotonic() < deadline, f"only {len(taken)} of {blocks} blocks came"
         block = camera.next_block(0.2)
         if block is not None:
+            # Once released, a block may be overwritten by the camera.
             taken.append(CameraBlock(block.first_line, block.pixels.copy(), block.flags.copy(), block.losses))
             camera.release(block)
     return taken

@@ -109,6 +109,7 @@ class SolverContract:
 
         def progress(step: Any) -> None:
             reported.append(step.iteration)
+            # At the first report: a solver that ignores it would run for 10 000 iterations.
             stop.set()
 
         result = self.solve(segment, iterations=10_000, progress=progress, stop=stop)

@@ -90,6 +90,7 @@ class TriggerContract:
     def test_stop_ends_a_wait_for_tags(self, trigger: Trigger) -> None:
         trigger.prepare(self.run(tag_every_lines=60_000))
         trigger.start()
+        # The first tag, after which 60 000 lines bring none: only the stop can end the wait.
         collect(trigger, 0)
         waited = []
 
@@ -115,5 +116,6 @@ def collect(trigger: Trigger, lines: int) -> list[LineTag]:
     deadline = time.monotonic() + WAIT_S
     while not tags or tags[-1].line < lines:
         assert time.monotonic() < deadline, f"only {len(tags)} tags came"
+        # In short waits, so that a trigger without tags fails at the deadline and does not hang.
         tags += trigger.tags(0.5)
     return tags

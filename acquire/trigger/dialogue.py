@@ -135,7 +135,13 @@ class Dialogue:
 
         Raises FrameLengthError for a payload that does not fit a frame; nothing is queued then.
         """
-        calls = [Call(kind, payload, _size_bytes(kind, payload)) for kind, payload in requests]
+        calls = []
+        for kind, payload in requests:
+            size_bytes = len(encode(Frame(kind, 0, payload)))
+            if kind == FrameType.READ:  # whose answer may be longer
+                _, count = parse_read(payload)
+                size_bytes = max(size_bytes, _EMPTY_DATA_BYTES + 4 * count)
+            calls.append(Call(kind, payload, size_bytes))
         self._queued += calls
         return calls
 
@@ -263,12 +269,3 @@ def results(calls: Sequence[Call]) -> list[Frame]:
             )
         raise RefusedError(error, address)
     return found
-
-
-def _size_bytes(kind: FrameType, payload: bytes) -> int:
-    """Return the encoded size of the request, or of the expected answer if that is longer."""
-    request = len(encode(Frame(kind, 0, payload)))
-    if kind != FrameType.READ:
-        return request
-    _, count = parse_read(payload)
-    return max(request, _EMPTY_DATA_BYTES + 4 * count)

@@ -106,7 +106,15 @@ class TriggerDriver:
             )
             status = device.status()
             if not status.at_rest and status.run == run_number(run.run_id):
-                self._take_over(run, status, values)
+                # Started by this driver or another program: a daemon that was killed and restarted finds its
+                # run alive, and may continue it.
+                if run not in (self._prepared, self._run):
+                    if device.configuration() != values:
+                        raise TriggerError(
+                            f"run {run.run_id!r} is {status}, with other settings",
+                            hint="stop it, or use another run id",
+                        )
+                    self._prepared, self._run, self._tags = run, None, None
                 return
             if not status.at_rest:
                 # End a run that our stop did not reach, but no run that this driver was not asked to stop.
@@ -164,8 +172,14 @@ class TriggerDriver:
                 self._stopped.wait(timeout_s)
             return []
         try:
-            patience_s = self._show_life(device)
-            return tags.take(device.link.tags(min(timeout_s, patience_s)))
+            if self._config.watchdog_s:
+                # It has to be reset while tags are taken; any valid request does that.
+                patience_s = min(self._config.watchdog_s / _SIGNS_OF_LIFE_PER_WATCHDOG, _SIGN_OF_LIFE_S)
+                if time.monotonic() > self._sign_of_life_s + patience_s:
+                    device.read(r.STATUS)
+                    self._sign_of_life_s = time.monotonic()
+                timeout_s = min(timeout_s, patience_s)
+            return tags.take(device.link.tags(timeout_s))
         except TriggerError as error:
             raise TriggerError(f"{error.message}; its tags have reported {tags}", hint=error.hint) from error
 
@@ -254,27 +268,6 @@ class TriggerDriver:
         if self._device is not None and self._device.link.dead is not None:
             self.release()
         return self.device()
-
-    def _take_over(self, run: TriggerRun, status: DeviceStatus, values: dict[r.Register, int]) -> None:
-        """Take over a run that is armed or running, started by this driver or another program."""
-        # A daemon that was killed and restarted finds its run alive, and may continue it.
-        if run in (self._prepared, self._run):
-            return
-        if self.device().configuration() != values:
-            raise TriggerError(
-                f"run {run.run_id!r} is {status}, with other settings", hint="stop it, or use another run id"
-            )
-        self._prepared, self._run, self._tags = run, None, None
-
-    def _show_life(self, device: Device) -> float:
-        """Reset the watchdog while tags are taken; return after what time it is due again."""
-        if not self._config.watchdog_s:
-            return float("inf")
-        patience_s = min(self._config.watchdog_s / _SIGNS_OF_LIFE_PER_WATCHDOG, _SIGN_OF_LIFE_S)
-        if time.monotonic() > self._sign_of_life_s + patience_s:
-            device.read(r.STATUS)  # any valid request resets it
-            self._sign_of_life_s = time.monotonic()
-        return patience_s
 
 
 def run_number(run_id: str) -> int:

@@ -90,18 +90,15 @@ class TagReader:
             self._newest_line = max(self._newest_line, tag.line)
             if not tag.flags & TagFlag.NO_LINES:
                 self.lines_known = max(self.lines_known, tag.line + 1)
-            ticks = self._ticks_since_start(tag.timestamp, tag.line)
+            # The ticks since the start that are nearest to the line's: 48 bits wrap after weeks.
+            expected = tag.line * self._run.line_period_ticks
+            ticks = expected + signed_ticks(tag.timestamp - self._start_tick - expected)
             self._events += [
                 TagEvent(tag.line, ticks, kind) for flag, kind in EVENTS.items() if tag.flags & flag
             ]
             if tag.flags & TagFlag.LINE:
                 found.append(LineTag(tag.line, tag.code_index, ticks))
         return found
-
-    def _ticks_since_start(self, timestamp: int, line: int) -> int:
-        """Return the ticks since the start, those nearest to the line's, since 48 bits wrap after weeks."""
-        expected = line * self._run.line_period_ticks
-        return expected + signed_ticks(timestamp - self._start_tick - expected)
 
 
 def signed_ticks(ticks: int) -> int:

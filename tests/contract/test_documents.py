@@ -35,6 +35,8 @@ SPAN = re.compile(r"`([^`\n]+)`")
 HEADING = re.compile(r"^#+ (.*)$", re.MULTILINE)
 FENCE = re.compile(r"```.*?```", re.DOTALL)
 QUOTED = re.compile(r"\"([^\"\n]+)\"")
+SPOKEN = re.compile(r"`([a-z]+ [^`\n]* [^`\n]*)`")
+"""Three or more words in backticks: what the program prints, and no name."""
 SHORTEST_WORDS = 8
 
 
@@ -197,13 +199,16 @@ def test_the_documented_reader_cuts_what_the_store_cuts(recording: Path) -> None
         found["cut"](recording / "run.zarr", 1990, 10)
 
 
-def test_troubleshooting_quotes_what_the_program_says() -> None:
+@pytest.mark.parametrize(
+    ("name", "quoted", "least"), [("TROUBLESHOOTING", QUOTED, 16), ("calibrate/FIRST_LIGHT", SPOKEN, 7)]
+)
+def test_symptoms_are_what_the_program_says(name: str, quoted: re.Pattern[str], least: int) -> None:
     source = "".join(path.read_text(encoding="utf-8") for path in (ROOT / "acquire").rglob("*.py"))
     joined = re.sub(r"\"\s*\n\s*f?\"", "", source)
-    rows = re.findall(r"^\| (.*?) \|", (ROOT / "acquire/TROUBLESHOOTING.md").read_text("utf-8"), re.MULTILINE)
-    said = [part.strip() for row in rows for quote in QUOTED.findall(row) for part in quote.split("…")]
+    rows = re.findall(r"^\| (.*?) \|", (ROOT / f"acquire/{name}.md").read_text("utf-8"), re.MULTILINE)
+    said = [part.strip() for row in rows for quote in quoted.findall(row) for part in quote.split("…")]
     said = [part for part in said if len(part) >= SHORTEST_WORDS]
-    assert len(said) > 15
+    assert len(said) >= least
     assert [part for part in said if part not in joined] == []
 
 

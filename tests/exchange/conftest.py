@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from acquire.cli import main
 from acquire.clock import ClockFit
 from acquire.codes import PrbsCode
 from acquire.lines import ARMS, LineBlock, LineFlag
@@ -16,6 +19,7 @@ from acquire.store.video_writer import VideoWriter
 from acquire.stream.tagger import Tagger
 from acquire.trigger.base import TriggerRun
 
+Cli = Callable[..., tuple[int, str, str]]
 M, S, FIRST, LINES = 6, 2, 100, 90
 LOST = range(130, 135)
 TIME = 1_700_000_000_000_000_000
@@ -77,3 +81,16 @@ def told(tmp_path_factory: pytest.TempPathFactory) -> Path:
         )
         writer.finish({"trusted": [TRUSTED.start, TRUSTED.stop], "error": error})
     return path
+
+
+@pytest.fixture
+def cli(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Cli:
+    monkeypatch.delenv("COLUMNS", raising=False)
+
+    def run(*words: object) -> tuple[int, str, str]:
+        monkeypatch.setattr(sys, "argv", ["acquire", *map(str, words)])
+        code = main()
+        said = capsys.readouterr()
+        return code, said.out, said.err
+
+    return run

@@ -16,7 +16,6 @@ import numpy as np
 import pytest
 import tifffile
 
-from acquire.cli import main
 from acquire.exchange import (
     arrays,
     export,
@@ -32,17 +31,6 @@ from acquire.store.present import flags_of
 
 FIRST, M, S, TRUSTED = 100, 6, 2, range(3, 17)
 Cli = Callable[..., tuple[int, str, str]]
-
-
-@pytest.fixture
-def cli(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Cli:
-    def run(*words: object) -> tuple[int, str, str]:
-        monkeypatch.setattr(sys, "argv", ["acquire", *map(str, words)])
-        code = main()
-        said = capsys.readouterr()
-        return code, said.out, said.err
-
-    return run
 
 
 def test_imagej_has_axes_interval_and_pixel_size(cli: Cli, video: Path, tmp_path: Path) -> None:

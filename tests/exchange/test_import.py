@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -14,7 +13,6 @@ import numpy as np
 import pytest
 import tifffile
 
-from acquire.cli import main
 from acquire.codes import mix_seed
 from acquire.config import load_rig, load_scene
 from acquire.errors import UsageError
@@ -29,19 +27,6 @@ STAGES, SUBSTEPS, LINES = 8, 2, 150
 CODE = f"prbs:64:{mix_seed(1, 64):#x}"
 SIZES = ("--stages", STAGES, "--substeps", SUBSTEPS, "--line-rate", 50_000, "--code", CODE)
 Cli = Callable[..., tuple[int, str, str]]
-
-
-@pytest.fixture
-def cli(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Cli:
-    monkeypatch.delenv("COLUMNS", raising=False)
-
-    def run(*words: object) -> tuple[int, str, str]:
-        monkeypatch.setattr(sys, "argv", ["acquire", *map(str, words)])
-        code = main()
-        said = capsys.readouterr()
-        return code, said.out, said.err
-
-    return run
 
 
 @pytest.fixture(scope="module")

@@ -3,18 +3,16 @@
 from __future__ import annotations
 
 import contextlib
-import json
 import os
 import signal
 import subprocess
 import sys
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import psutil
+from answers import Answer
 
 from acquire.client import Client
 from acquire.config import builtin_directory
@@ -60,19 +58,6 @@ scene = "{scene}"
 """
 LINE_RATE_HZ = 10_000
 SUBSTEPS = 2
-
-
-@dataclass(frozen=True)
-class Answer:
-    """Output and exit code of a command."""
-
-    code: int
-    out: str
-    err: str
-
-    @property
-    def json(self) -> Any:
-        return json.loads(self.out)
 
 
 def acquire(*words: object, socket: Path | None = None, cwd: Path | None = None) -> Answer:

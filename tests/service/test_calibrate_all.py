@@ -76,18 +76,28 @@ def target() -> str:
     return 'kind = "leds"' + "".join(dots)
 
 
+def scene_before(directory: Path) -> tuple[Callable[[str], None], tuple[str, ...]]:
+    """Return what puts a scene before the cameras, now a white one, and the settings of a rig that sees it.
+
+    The rig names a calibration that is not there yet.
+    """
+
+    def put(scene: str) -> None:
+        fresh = directory / "fresh.toml"
+        fresh.write_text(scene + EFFECTS)
+        fresh.replace(directory / "scene.toml")
+
+    put(WHITE)
+    places = f"simulation.scene='{directory}/scene.toml'", f"calibration='{directory}/cal.zarr'"
+    return put, (*SETTINGS, *places)
+
+
 @pytest.fixture
 def bench(tmp_path: Path) -> Iterator[tuple[Daemon, Callable[[str], None]]]:
     """A daemon, and a function that puts a scene in front of its cameras."""
 
-    def put(scene: str) -> None:
-        fresh = tmp_path / "fresh.toml"
-        fresh.write_text(scene + EFFECTS)
-        fresh.replace(tmp_path / "scene.toml")
-
-    put(WHITE)
-    scene, cal = f"simulation.scene='{tmp_path}/scene.toml'", f"calibration='{tmp_path}/cal.zarr'"
-    daemon = Daemon(tmp_path, *SETTINGS, scene, cal)  # which is not there yet
+    put, settings = scene_before(tmp_path)
+    daemon = Daemon(tmp_path, *settings)
     try:
         yield daemon, put
     finally:

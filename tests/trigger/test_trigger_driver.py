@@ -105,12 +105,12 @@ def test_a_mismatch_names_both_sides(register, value, words) -> None:
 def test_a_setting_that_does_not_read_back_is_an_error() -> None:
     with wired_model() as model:
         driver = driver_of(model, light={"open_ticks": 100})
-        kept = model.registers._write_register
+        kept = model.registers.write
 
-        def forgetful(register, address, word):
-            kept(register, address, 0 if register is r.WINDOW_OPEN else word)
+        def forgetful(address, word):
+            kept(address, 0 if address == r.WINDOW_OPEN.address else word)
 
-        model.registers._write_register = forgetful
+        model.registers.write = forgetful
         with pytest.raises(TriggerError, match="WINDOW_OPEN reads 0x0 where 0x64 was written"):
             driver.prepare(run())
         driver.close()

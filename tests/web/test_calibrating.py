@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import pytest
 from live_daemon import Daemon
 from page_server import address_in
-from test_calibrate_all import EFFECTS, SETTINGS, WHITE, target
+from test_calibrate_all import WHITE, scene_before, target
 from waiting import until
 
 from acquire.calibrate import open_calibration
@@ -31,17 +31,10 @@ SCREENSHOTS = os.environ.get("ACQUIRE_SCREENSHOTS")
 @pytest.fixture
 def bench(tmp_path: Path) -> Iterator[tuple[Daemon, Callable[[str], None]]]:
     """A daemon with a page, and what puts a scene before its cameras."""
-
-    def put(scene: str) -> None:
-        fresh = tmp_path / "fresh.toml"
-        fresh.write_text(scene + EFFECTS)
-        fresh.replace(tmp_path / "scene.toml")
-
-    put(WHITE)
-    scene, cal = f"simulation.scene='{tmp_path}/scene.toml'", f"calibration='{tmp_path}/cal.zarr'"
+    put, settings = scene_before(tmp_path)
     with socket.create_server(("127.0.0.1", 0)) as free:  # the page that is started anew has the same address
         port = free.getsockname()[1]
-    with contextlib.closing(Daemon(tmp_path, *SETTINGS, scene, cal, f"web.port={port}")) as made:
+    with contextlib.closing(Daemon(tmp_path, *settings, f"web.port={port}")) as made:
         yield made, put
 
 

@@ -128,7 +128,13 @@ class AravisCamera:
         bits, skips_zero = self._frame_ids()
         buffers = buffer_count(self._spec, found)
         self._assembly = Assembly(found, replace(self._spec, frame_id_bits=bits), buffers, skips_zero)
-        self._packets = self._packets_per_frame()
+        self._packets = 1
+        if library.arv_camera_is_gv_device(self._camera):
+            with errors(what) as error:
+                size = library.arv_camera_gv_get_packet_size(self._camera, error)
+            # A frame that finds no buffer is counted once for each of its packets, of which two more, leader
+            # and trailer, have no lines.
+            self._packets = 2 + math.ceil(self._payload / max(1, int(size) - _HEADERS_BYTES))
         stream = self._prepare()
         for _ in range(buffers):
             self._give(stream, library.arv_buffer_new_allocate(self._payload))
@@ -146,15 +152,6 @@ class AravisCamera:
         mode = self._features.find("GevGVSPExtendedIDMode")
         extended = mode is not None and mode.readable and mode.read() == "On"
         return self._spec.frame_id_bits or (64 if extended else 16), True
-
-    def _packets_per_frame(self) -> int:
-        # Over GigE Vision, a frame that finds no buffer is counted once for each of its packets.
-        if not self._library.arv_camera_is_gv_device(self._camera):
-            return 1
-        with errors(f"arm camera {self._spec.serial}") as error:
-            size = self._library.arv_camera_gv_get_packet_size(self._camera, error)
-        # Two more packets, leader and trailer, have no lines.
-        return 2 + math.ceil(self._payload / max(1, int(size) - _HEADERS_BYTES))
 
     def _give(self, stream: int, buffer: int) -> None:
         """Queue a buffer for Aravis to fill."""
@@ -195,7 +192,10 @@ class AravisCamera:
             missed = self._missed.count()
         except CameraError as error:
             raise CameraLostError(f"camera {self._spec.serial} is gone: {error.message}") from error
-        underruns = self._starved_frames()
+        counts = c_uint64(), c_uint64(), c_uint64()
+        self._library.arv_stream_get_statistics(self._stream, *map(byref, counts))
+        # Of completed, failed and starved buffers. Rounded up: a frame may be counted only in part so far.
+        underruns = math.ceil(counts[2].value / self._packets)
         for buffer in buffers:
             # The stream was ended before this buffer was filled: it stands for no frame.
             if self._library.arv_buffer_get_status(buffer) == _ABORTED:
@@ -207,12 +207,6 @@ class AravisCamera:
             for idle in free:
                 self._taken.remove(idle)
                 self._give(self._stream, idle)
-
-    def _starved_frames(self) -> int:
-        counts = c_uint64(), c_uint64(), c_uint64()
-        self._library.arv_stream_get_statistics(self._stream, *map(byref, counts))
-        # Of completed, failed and starved buffers. Rounded up: a frame may be counted only in part so far.
-        return math.ceil(counts[2].value / self._packets)
 
     def _frame(self, buffer: int, underruns: int, missed: int) -> Frame:
         library, size = self._library, c_size_t()

@@ -45,14 +45,20 @@ def demo(
         ),
     ] = None,
     twist_budget: Annotated[
-        float, typer.Option(parser=seconds, metavar="TIME", help="Time limit for the paper's solver, TwIST.")
+        float,
+        typer.Option(
+            parser=seconds,
+            metavar="TIME",
+            help=f"Time limit for the paper's solver, TwIST. Default: {TWIST_BUDGET_S:g}s.",
+            show_default=False,
+        ),
     ] = TWIST_BUDGET_S,
     config: Annotated[
         str,
         typer.Option(
             "--config",
             "-c",
-            metavar="FILE",
+            metavar="RIG",
             autocompletion=rigs,
             help="Rig file, or the name of a built-in rig.",
         ),

@@ -77,5 +77,6 @@ def box(ax: Axes, rows: slice, columns: slice, colour: str = HIGHLIGHT, width: f
 
 def correlation(a: NDArray[Any], b: NDArray[Any]) -> float:
     """Return Pearson's correlation over the samples that are known in both."""
+    # light cannot be known where the code is dark, and is NaN there
     known = np.isfinite(a) & np.isfinite(b)
     return float(np.corrcoef(a[known], b[known])[0, 1])

@@ -79,6 +79,7 @@ def figure(studio: Studio) -> PaperFigure:
         ),
         seconds=dict(studio.seconds),
         numbers=shot.numbers(),
+        # every fourth frame of 10 µs
         movie={"ours": video[::4], "truth": truth[::4]},
         movie_ms=0.04,
     )

@@ -81,6 +81,7 @@ def figure(studio: Studio) -> PaperFigure:
         ),
         seconds=dict(studio.seconds),
         numbers=shot.numbers(),
+        # three of the circle's periods, every second frame of 10 µs
         movie={"ours": video[100:400:2], "truth": truth[100:400:2]},
         movie_ms=0.02,
     )

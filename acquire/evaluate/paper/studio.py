@@ -153,6 +153,7 @@ class Studio:
             options.budget_s,
             solver=options.solver,
             iterations=options.iterations,
+            # a figure shows a poor result rather than none
             refuse=False,
         )
         self._end(what, result.seconds)

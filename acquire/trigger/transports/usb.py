@@ -42,19 +42,18 @@ def list_devices(backend: Any = None) -> list[FoundDevice]:
         found = list(usb.core.find(find_all=True, idVendor=VENDOR, idProduct=PRODUCT, backend=backend) or ())
     except usb.core.NoBackendError as error:
         raise TriggerError("no USB: libusb is not installed", hint="install libusb-1.0") from error
-    return [_look(device) for device in found]
-
-
-def _look(device: Any) -> FoundDevice:
-    # Reading a serial number opens the device, which requires permission, and is undone below.
-    name = f"usb {VENDOR:04x}:{PRODUCT:04x}"
-    try:
-        serial = str(device.serial_number or "")
-    except (usb.core.USBError, ValueError) as error:  # ValueError: no permission to read the languages
-        return FoundDevice(name, "", f"it may not be opened ({error}); try: {UDEV_HINT}")
-    finally:
-        usb.util.dispose_resources(device)
-    return FoundDevice(name, serial, "")
+    name, listed = f"usb {VENDOR:04x}:{PRODUCT:04x}", []
+    for device in found:
+        serial = trouble = ""
+        # Reading a serial number opens the device, which requires permission, and is undone below.
+        try:
+            serial = str(device.serial_number or "")
+        except (usb.core.USBError, ValueError) as error:  # ValueError: no permission to read the languages
+            trouble = f"it may not be opened ({error}); try: {UDEV_HINT}"
+        finally:
+            usb.util.dispose_resources(device)
+        listed.append(FoundDevice(name, serial, trouble))
+    return listed
 
 
 class UsbTransport:
