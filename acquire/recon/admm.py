@@ -148,12 +148,16 @@ class Admm:
         """Start from the state of another solver with as many coefficients, whatever its weights."""
         old, new = other._parameters, self._parameters
         self.theta = self._xp.asarray(other.theta, copy=True)
-        # w is the residual of the lines divided by ρ
-        self._w = other._w * (old.penalty / new.penalty)
-        self._lifted = self._operator.adjoint(self._w)
+        self.adopt(other)
         self._tv_multiplier = other._tv_multiplier * (old.tv_penalty / new.tv_penalty)
         # the splits are in units of θ; only multipliers are divided by ρ
         self._signed = _rescaled(self._xp, other._signed, old.sign_penalty / new.sign_penalty)
+
+    def adopt(self, other: Admm) -> None:
+        """Take over w, which belongs to the lines, from a solver in any basis."""
+        # w is the residual of the lines divided by ρ
+        self._w = other._w * (other._parameters.penalty / self._parameters.penalty)
+        self._lifted = self._operator.adjoint(self._w)
 
     def with_problem(self, operator: MaskedOperator, samples: Array, heavier: float = 1.0) -> Admm:
         """A solver that continues from here with other samples or another mask, and a ``heavier`` prior.

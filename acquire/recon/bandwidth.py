@@ -32,6 +32,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from acquire.arrays import Arrays
+    from acquire.geometry import Geometry
     from acquire.lines import Segment
     from acquire.recon.problem import Problem
 
@@ -68,17 +69,34 @@ def estimate_coefficients(
     # the answer would be the same whatever the lines show
     if most <= FEWEST_COEFFICIENTS:
         return min(frames, FEWEST_COEFFICIENTS)
-    merge = max(spatial_merge, -(-segment.geometry.size // COARSE_SIDE))
+    merge = _coarse(segment.geometry, spatial_merge)
     # whatever the dtype of the video: only the end of the signal is wanted
     arrays = replace(problem.arrays, dtype="float32")
     theta = _tentative(segment, (merge, temporal_merge), most, hurry, arrays)
     last = _end_of_signal(np.square(theta, dtype=np.float64).sum((1, 2)))
-    # a criterion that needs no truth: the size of the coarse voxels relative to those they stand for
-    held = merge <= max(spatial_merge, HELD_BY * segment.geometry.substeps)
     slow = MARGIN * last <= FEWEST_COEFFICIENTS
-    if not (held and slow) and affords(search_seconds(segment.geometry, temporal_merge, LARGEST_SHARE)):
-        last = max(last, last_lamp(segment, problem, temporal_merge, LARGEST_SHARE, hurry))
+    if is_large(segment.geometry, spatial_merge) or not slow:
+        last = max(last, fastest_lamp(segment, problem, temporal_merge, hurry, affords))
     return int(np.clip(MARGIN * last, FEWEST_COEFFICIENTS, most))
+
+
+def is_large(geometry: Geometry, spatial_merge: int) -> bool:
+    """Whether coarse voxels cover so many pixels that their errors may hide a fast lamp."""
+    # a criterion that needs no truth: the size of the coarse voxels relative to those they stand for
+    return _coarse(geometry, spatial_merge) > max(spatial_merge, HELD_BY * geometry.substeps)
+
+
+def fastest_lamp(
+    segment: Segment,
+    problem: Problem,
+    temporal_merge: int,
+    hurry: Callable[[], bool],
+    affords: Callable[[float], bool],
+) -> int:
+    """Number of cosines up to the fastest lamp of the lines' covariance; 0 if there is none, or no time."""
+    if not affords(search_seconds(segment.geometry, temporal_merge, LARGEST_SHARE)):
+        return 0
+    return last_lamp(segment, problem, temporal_merge, LARGEST_SHARE, hurry)
 
 
 def light_beyond(
@@ -106,6 +124,11 @@ def light_beyond(
     ratio[:count] = 0
     highest = int(np.argmax(ratio))
     return highest if ratio[highest] > STANDS_OUT else None
+
+
+def _coarse(geometry: Geometry, spatial_merge: int) -> int:
+    """N_m of the coarse voxels."""
+    return max(spatial_merge, -(-geometry.size // COARSE_SIDE))
 
 
 def _tentative(

@@ -42,6 +42,10 @@ class Basis(Protocol):
 
     def matrix(self, grid: int | None = None) -> NDArray[Any]: ...
 
+    def spread(self, theta: Array) -> Array:
+        """Coefficients of the cosines, (count, …) → (cosines, …)."""
+        ...
+
     def synthesize(self, theta: Array) -> Array: ...
 
     def analyze(self, video: Array) -> Array: ...
@@ -75,6 +79,10 @@ class TemporalBasis:
         matrix: NDArray[Any] = rows.astype(self.arrays.dtype)
         return matrix
 
+    def spread(self, theta: Array) -> Array:
+        """Coefficients of the cosines: these themselves."""
+        return theta
+
     def synthesize(self, theta: Array) -> Array:
         """x = Dᵀ·θ: (K, …) → (T, …)."""
         if not self.arrays.compiled:
@@ -103,9 +111,13 @@ class LearnedBasis:
         matrix: NDArray[Any] = self.curves.T @ self._within.matrix(grid)
         return matrix
 
+    def spread(self, theta: Array) -> Array:
+        """Coefficients of the cosines: (R, …) → (K, …)."""
+        return _product(self.arrays, self.curves, theta)
+
     def synthesize(self, theta: Array) -> Array:
         """x = Dᵀ·θ: (R, …) → (T, …)."""
-        return self._within.synthesize(_product(self.arrays, self.curves, theta))
+        return self._within.synthesize(self.spread(theta))
 
     def analyze(self, video: Array) -> Array:
         """θ = D·x: (T, …) → (R, …)."""
@@ -117,7 +129,7 @@ def _product(arrays: Arrays, matrix: NDArray[Any], frames: Array) -> Array:
     return arrays.xp.tensordot(arrays.asarray(matrix), frames, axes=1)
 
 
-def resized(theta: Array, basis: TemporalBasis) -> Array:
+def resized(theta: Array, basis: Basis) -> Array:
     """Coefficients cut or zero-padded to the number of cosines of ``basis``."""
     # the first cosines are the same whatever their number, so that coefficients keep their meaning
     xp, kept = basis.arrays.xp, theta[: min(basis.count, theta.shape[0]), ...]

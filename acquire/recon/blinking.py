@@ -9,6 +9,7 @@ Nothing here uses the truth: the held-out samples judge what is found.
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -16,15 +17,26 @@ import numpy as np
 from acquire.arrays import host
 from acquire.recon.admm import Admm, AdmmParameters
 from acquire.recon.band import band_operator
-from acquire.recon.bandwidth import FEWEST_COEFFICIENTS, MARGIN, estimate_coefficients, light_beyond
+from acquire.recon.bandwidth import (
+    FEWEST_COEFFICIENTS,
+    MARGIN,
+    estimate_coefficients,
+    fastest_lamp,
+    is_large,
+    light_beyond,
+)
 from acquire.recon.basis import TemporalBasis, resized
 from acquire.recon.estimates import InBand, Refined
 from acquire.recon.patterns import PARAMETERS, ROUND, Refinement, find_patterns
+from acquire.recon.pursuit import pursue, widened
 from acquire.recon.settling import settle
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
+
     from acquire.arrays import Array
     from acquire.lines import Segment
+    from acquire.recon.basis import Basis
     from acquire.recon.clock import IterationClock
     from acquire.recon.estimates import Estimate
     from acquire.recon.options import SolveOptions
@@ -84,7 +96,8 @@ def first_look(
     still: Array | None = None,
 ) -> InBand:
     """A first look in the requested or estimated band, from the coefficients (1, n′, n′) of a still."""
-    first = glance(segment, problem, options, clock, still)
+    count = find_band(segment, problem, options, clock)
+    first = _glance(segment, problem, options, clock, count=count, still=still)
     complete_look(first, options, clock)
     return first
 
@@ -97,8 +110,34 @@ def glance(
     still: Array | None = None,
 ) -> InBand:
     """The first iterations of a first look, after which it can be compared with other priors."""
+    lamps = _look_for_lamps(segment, problem, options, clock, still)
+    if lamps is not None:
+        return lamps
+    clock.reset()  # the limit holds for each stage
     count = find_band(segment, problem, options, clock)
     return _glance(segment, problem, options, clock, count=count, still=still)
+
+
+def _look_for_lamps(
+    segment: Segment, problem: Problem, options: SolveOptions, clock: IterationClock, still: Array | None
+) -> InBand | None:
+    """A first look in the slow cosines and those of lamps; None if there is no lamp, or no time."""
+    if clock.spent(UNSEARCHED_SHARE):
+        return None
+    merges = (options.spatial_merge, options.temporal_merge)
+
+    def iterations(look: InBand, most: int) -> Iterator[int]:
+        most = min(most, _at_most(FIRST_LOOK, options) - clock.done)
+        return clock.run(most, "first look", FIRST_LOOK_SHARE, look.video)
+
+    def search() -> int:
+        if not is_large(segment.geometry, options.spatial_merge):
+            return 0
+        hurry, affords = partial(clock.spent, TENTATIVE_SHARE), partial(clock.affords, share=LAMPS_SHARE)
+        return fastest_lamp(segment, problem, options.temporal_merge, hurry, affords)
+
+    begin = partial(_begin, segment, problem, options)
+    return pursue(segment, problem, merges, begin, iterations, search, still)
 
 
 def refine(
@@ -109,7 +148,7 @@ def refine(
     if not clock.affords(BEYOND_S * segment.geometry.lines * first.basis.frames):
         return found
     predicted = found.predict()
-    beyond = light_beyond(segment, problem, predicted, options.temporal_merge, first.basis.count)
+    beyond = light_beyond(segment, problem, predicted, options.temporal_merge, first.basis.cosines)
     if beyond is None:
         return found
     rate_hz = 1e9 / (segment.substep_ns * options.temporal_merge)
@@ -121,9 +160,12 @@ def refine(
         clock.shortcuts.append(f"{faster}: a longer budget or a higher bandwidth shows it")
         return found
     clock.reset()
-    count = round(MARGIN * (beyond + 1))
-    # the constant cosine is a still, of which the wider band is to find the change
-    first = _glance(segment, problem, options, clock, count=count, still=first.solver.theta[:1, ...])
+    if isinstance(found, Refined):
+        first = widened(first, beyond, problem, partial(_begin, segment, problem, options))
+    else:
+        # the constant cosine is a still, of which the wider band is to find the change
+        still, count = first.solver.theta[:1, ...], round(MARGIN * (beyond + 1))
+        first = _glance(segment, problem, options, clock, count=count, still=still)
     complete_look(first, options, clock)
     wider = _refine(segment, problem, options, clock, first)
     before, after = problem.prediction_error(predicted), problem.prediction_error(wider.predict())
@@ -162,26 +204,9 @@ def _glance(
     about sub-steps without light, and total variation ignores flat light. From a still, the solver finds the
     smallest change that explains them.
     """
-    N_m, T_m = options.spatial_merge, options.temporal_merge
-    frames, side, _ = segment.geometry.video_shape(N_m, T_m)
+    frames = segment.geometry.video_shape(options.spatial_merge, options.temporal_merge)[0]
     basis = TemporalBasis(frames, min(frames, count), problem.arrays)
-    operator = band_operator(segment.geometry, segment.code, basis, N_m, T_m, segment.alignment, segment.blur)
-
-    def begin(start: Array | None, *, explained: bool = False) -> InBand:
-        parameters = _defaults(frames, explained=explained)
-        if options.tv_weight is not None:
-            parameters = replace(parameters, tv_weight=options.tv_weight)
-        solver = Admm(
-            problem.masked(operator),
-            problem.used_samples,
-            (basis.count, side, side),
-            basis,
-            parameters,
-            start=start,
-            denoiser=options.denoiser,
-        )
-        return InBand(solver, operator, basis, problem, parameters)
-
+    begin = partial(_begin, segment, problem, options, basis)
     start = None if still is None else resized(still, basis)
     if options.initial is not None:
         # in the solvers' units, as `_Run.in_scene_units` undoes at the end
@@ -194,6 +219,34 @@ def _glance(
         # freed of the high penalties, few frames at rest reached 36 dB instead of 21
         estimate = begin(estimate.solver.theta, explained=True)
     return estimate
+
+
+def _begin(
+    segment: Segment,
+    problem: Problem,
+    options: SolveOptions,
+    basis: Basis,
+    start: Array | None,
+    *,
+    explained: bool = False,
+) -> InBand:
+    """A solver in the coefficients of a basis, from a start."""
+    N_m, T_m = options.spatial_merge, options.temporal_merge
+    frames, side, _ = segment.geometry.video_shape(N_m, T_m)
+    operator = band_operator(segment.geometry, segment.code, basis, N_m, T_m, segment.alignment, segment.blur)
+    parameters = _defaults(frames, explained=explained)
+    if options.tv_weight is not None:
+        parameters = replace(parameters, tv_weight=options.tv_weight)
+    solver = Admm(
+        problem.masked(operator),
+        problem.used_samples,
+        (basis.count, side, side),
+        basis,
+        parameters,
+        start=start,
+        denoiser=options.denoiser,
+    )
+    return InBand(solver, operator, basis, problem, parameters)
 
 
 def complete_look(first: InBand, options: SolveOptions, clock: IterationClock) -> None:
@@ -225,7 +278,8 @@ def _in_patterns(
     found = find_patterns(host(first.solver.theta))
     if found is None:
         return None
-    basis = TemporalBasis(first.basis.frames, first.basis.count, problem.arrays)
+    basis = TemporalBasis(first.basis.frames, first.basis.cosines, problem.arrays)
+    found = replace(found, curves=host(first.basis.spread(problem.arrays.asarray(found.curves))))
     merges = (options.spatial_merge, options.temporal_merge)
     clock.reset()  # the limit holds for each stage: the first look takes longer where patterns are in doubt
     refinement = Refinement(segment, problem, basis, found, merges, _for_noise(segment, problem, first))
@@ -266,8 +320,8 @@ def find_band(segment: Segment, problem: Problem, options: SolveOptions, clock: 
         segment,
         problem,
         (N_m, T_m),
-        hurry=lambda: clock.spent(TENTATIVE_SHARE),
-        affords=lambda seconds: clock.affords(seconds, LAMPS_SHARE),
+        partial(clock.spent, TENTATIVE_SHARE),
+        partial(clock.affords, share=LAMPS_SHARE),
     )
 
 

@@ -138,7 +138,7 @@ def _choose(
         tried.smooth = bench.probe(bench.fitting(SMOOTH), min(at_a_glance, tried.best.error))
         # the first cosine is constant, so that this is the video's mean over time
         picture = (cosines.basis.matrix()[0, 0] * host(cosines.solver.theta[0, ...])).clip(0)
-        tried.bright = bench.brighten(picture, cosines.basis.count, min(at_a_glance, tried.best.error))
+        tried.bright = bench.brighten(picture, cosines.basis.cosines, min(at_a_glance, tried.best.error))
     ahead, refined = at_a_glance <= OUTDONE * tried.best.error, None
     if ahead:
         complete_look(cosines, options, clock)

@@ -141,7 +141,10 @@ class CurveFit:
         before, slope = start.T.ravel().astype(np.float64), gradient.T.ravel().astype(np.float64)
         if self._learns and self.prior is None and start.any():
             # to begin with, the curves as they are and all of the residual as noise
-            self.prior = CurvePrior(np.square(start, dtype=np.float64).mean(1), energy / samples)
+            likely = np.square(start, dtype=np.float64).mean(1)
+            # of cosines that were not solved for nothing is known, and without light they would stay dark
+            likely[likely == 0] = np.median(likely[likely > 0])
+            self.prior = CurvePrior(likely, energy / samples)
         diagonal = np.diag_indices_from(gram)
         for _ in range(EVIDENCE_STEPS if self._learns else 1):
             added = np.zeros(len(gram)) if self.prior is None else np.tile(self.prior.precision[:, 0], rank)

@@ -45,6 +45,7 @@ if TYPE_CHECKING:
 
 REGIONS = 8
 """Number of regions along rows and along columns, of equal size."""
+FRAMES_AT_ONCE = 64
 BRIGHT = 0.999
 """Quantile of the voxels that defines the full scale."""
 
@@ -228,20 +229,29 @@ def measure_indicators(
     if not (scale > 0 and residual > 0):
         return None
     # what follows enters ratios and logarithms, so that none of it may be 0
-    floor = exponents.floor * scale
-    change, edge = shown - shown.mean(0), np.zeros_like(shown)
-    edge[:, :-1] += np.square(np.diff(shown, axis=1))
-    edge[:, :, :-1] += np.square(np.diff(shown, axis=2))
+    floor, mean = exponents.floor * scale, shown.mean(0)
+    change, edge = np.zeros(mean.shape), np.zeros(mean.shape)
+    for part in _parts(shown):
+        change += np.square(part - mean, dtype=np.float64).sum(0)
+        edge[:-1] += np.square(np.diff(part, axis=1), dtype=np.float64).sum(0)
+        edge[:, :-1] += np.square(np.diff(part, axis=2), dtype=np.float64).sum(0)
+    pairs = zip(_parts(changed), _parts(video), strict=True)
+    distance = np.concatenate([in_regions(np.square(one - other)) for one, other in pairs])
     return Indicators(
         exponents,
         residual,
         scale,
-        sensitivity=np.sqrt(growth**2 * in_regions(np.square(changed - video)) + floor**2),
-        change=np.sqrt(in_regions(np.square(change)).mean(0) + floor**2),
-        edge=np.sqrt(in_regions(edge).mean(0) + floor**2),
+        sensitivity=np.sqrt(growth**2 * distance + floor**2),
+        change=np.sqrt(in_regions(change[None] / len(shown))[0] + floor**2),
+        edge=np.sqrt(in_regions(edge[None] / len(shown))[0] + floor**2),
         drift=drift,
         fine=fine,
     )
+
+
+def _parts(frames: NDArray[Any]) -> list[NDArray[Any]]:
+    """Frames some at a time: a video of a large sensor is a gigabyte, and so would each intermediate be."""
+    return [frames[first : first + FRAMES_AT_ONCE] for first in range(0, len(frames), FRAMES_AT_ONCE)]
 
 
 def error_from(indicators: Indicators, trusted: slice, exponents: Exponents | None = None) -> VideoError:
@@ -294,7 +304,8 @@ def in_regions(frames: NDArray[Any]) -> NDArray[np.float64]:
 
 
 def rms_of(values: NDArray[Any]) -> float:
-    return float(np.sqrt(np.square(values, dtype=np.float64).mean()))
+    total = sum(float(np.square(part, dtype=np.float64).sum()) for part in _parts(values))
+    return float(np.sqrt(total / values.size))
 
 
 def full_scale(video: NDArray[Any]) -> float:

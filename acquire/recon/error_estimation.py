@@ -77,6 +77,8 @@ def estimate_error(
     if not (isinstance(estimate, Continuable) and problem.held_out.any()):
         return UNSUPPORTED
     began_s = clock.processor_s
+    # before there is a second video: of a large sensor, each is a gigabyte
+    white = white_error(segment, problem, merges)
     facts = estimate.facts()
     at_rest = facts.get("prior") == "still" or bool(facts.get("change"))
     fine = at_rest and merges[0] < segment.geometry.substeps
@@ -92,9 +94,8 @@ def estimate_error(
         return continued
     indicators = measure_indicators(
         video,
-        # clipped as the video is that it is compared with
-        np.maximum(continued.video * problem.scale, 0),
-        white_error(segment, problem, residual, merges),
+        _shown(continued.video, problem),
+        residual * white,
         trusted,
         exponents,
         growth=(ITERATIONS / continued.made) ** continued.growth,
@@ -154,7 +155,9 @@ def _drift_distances(
     distances: dict[int, float] = {}
 
     def distance() -> float:
-        return rms_of(np.maximum(continuation.video()[trusted] * problem.scale, 0) - video[trusted])
+        shown = _shown(continuation.video()[trusted], problem)
+        shown -= video[trusted]
+        return rms_of(shown)
 
     made = 0
     for made, _ in enumerate(clock.run_reserved(ITERATIONS, repeat=2 * EARLY[0]), 1):
@@ -162,6 +165,13 @@ def _drift_distances(
         if made in EARLY:
             distances[made] = distance()
     return distances | {made: distance()} if made else {}
+
+
+def _shown(video: NDArray[Any], problem: Problem) -> NDArray[Any]:
+    """A dimensionless video in scene units, in its place, clipped as is the video it is compared with."""
+    video *= problem.scale
+    np.maximum(video, 0, out=video)
+    return video
 
 
 def _drift_exponent(distances: dict[int, float], floor: float) -> float | None:
@@ -174,8 +184,8 @@ def _drift_exponent(distances: dict[int, float], floor: float) -> float | None:
     return float(np.clip(np.log(change[1] / change[0]) / np.log(last / early), -1, 1))
 
 
-def white_error(segment: Segment, problem: Problem, residual: float, merges: tuple[int, int]) -> float:
-    """RMS of independent errors of all voxels, in scene units, that cause the relative ``residual``."""
+def white_error(segment: Segment, problem: Problem, merges: tuple[int, int]) -> float:
+    """RMS of independent errors of all voxels, in scene units, relative to the residual that they cause."""
     operator = DualArm(
         segment.geometry, segment.code, *merges, alignment=segment.alignment, blur=segment.blur
     )
@@ -186,4 +196,4 @@ def white_error(segment: Segment, problem: Problem, residual: float, merges: tup
     signs -= 1
     of_one = float(np.sqrt(np.square(operator.forward(signs)[problem.usable], dtype=np.float64).mean()))
     level = float(np.sqrt(np.square(problem.samples[problem.held_out], dtype=np.float64).mean()))
-    return residual * level * problem.norm * problem.scale / max(of_one, 1e-30)
+    return level * problem.norm * problem.scale / max(of_one, 1e-30)

@@ -78,7 +78,7 @@ class InBand:
 
     def facts(self) -> dict[str, Any]:
         # the count is what `reconstruct` derives ``resolved_hz`` from
-        return {"temporal_coefficients": self.basis.count} | asdict(self._parameters)
+        return {"temporal_coefficients": self.basis.cosines} | asdict(self._parameters)
 
     def step(self) -> None:
         self.solver.step()

@@ -1,0 +1,211 @@
+"""First look at a scene of lamps: the slow cosines, and a few about the rhythm of each lamp.
+
+    slow cosines ─▶ some iterations ─▶ cosines that stand out of the residual ─▶ slow cosines and these ─▶ …
+
+A lamp of some thousand hertz needs a hundred cosines or more, nearly all of which hold nothing: they cost the
+time of the first look and admit noise, in which patterns are hard to tell from errors. What the slow cosines
+leave of the lines shows the lamps. It also shows sidelobes of the code, through which slow light reaches some
+fast cosines; given coefficients, these stay dark, whereas a lamp outshines the slow cosines. Where no lamp is
+found, nothing is lost: the whole band is searched for and solved in, as for any other scene.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from acquire.arrays import host
+from acquire.recon.admm import Admm
+from acquire.recon.band import band_operator
+from acquire.recon.bandwidth import FEWEST_COEFFICIENTS, MARGIN
+from acquire.recon.basis import LearnedBasis, TemporalBasis, resized
+from acquire.recon.patterns import find_patterns
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+
+    from numpy.typing import NDArray
+
+    from acquire.arrays import Array
+    from acquire.lines import Segment
+    from acquire.recon.estimates import InBand
+    from acquire.recon.problem import Problem
+
+NONE = np.zeros(0, np.int64)
+ROUND, ROUNDS = 10, 6
+"""Number of iterations between two looks at the residual, and the largest number of these."""
+COARSE_SIDE = 48
+"""Voxels along a side in which the residual is looked at: a lamp covers many, and noise averages out."""
+STANDS_OUT, AT_ONCE = 5.0, 6
+"""Ratio to the median of the cosines not solved for above which one may be a lamp's, and the largest number
+that one look adds."""
+BESIDE = 2
+"""Number of cosines on either side: a span that is no multiple of the lamp's period spreads its light."""
+DARK, LAMP = 2.0, 8.0
+"""Energy of a cosine, relative to the median of the faster half of the slow ones, below which it is dropped
+after a round, and above which it is a lamp's in the end. Lamps reach 2.5 (M = 256) to 30 in a round and
+hundreds later; sidelobes of the code mostly less than 2, and at most 27."""
+FAINT = 0.02
+"""Energy of a lamp, relative to the brightest one's, below which it may be a sidelobe (up to 0.013): it does
+not widen the band, but may still be found in the residual of the patterns."""
+
+
+def pursue(
+    segment: Segment,
+    problem: Problem,
+    merges: tuple[int, int],
+    begin: Callable[[LearnedBasis, Array | None], InBand],
+    iterations: Callable[[InBand, int], Iterator[int]],
+    fastest_lamp: Callable[[], int],
+    still: Array | None = None,
+) -> InBand | None:
+    """Look at the scene in the slow cosines and those of its lamps; None if it has none that are faster.
+
+    ``begin`` makes an estimate in a basis from coefficients, ``iterations`` yields before each that may run,
+    and ``fastest_lamp`` is the number of cosines up to the fastest lamp, as `lamps.last_lamp`, or 0.
+    """
+    frames = segment.geometry.video_shape(*merges)[0]
+    fastest = frames // 2
+    # as for the search of a band: without a margin of cosines there is nothing to stand out of
+    if fastest < 2 * FEWEST_COEFFICIENTS:
+        return None
+    residual_energy = _spectrum(segment, problem, merges[1], fastest)
+    lamps = sure = NONE
+    told, dark = None, np.zeros(fastest, bool)
+    kept = _windows(lamps, fastest)
+    basis = _basis(kept, frames, problem)
+    look = begin(basis, None if still is None else resized(still, basis))
+    for made in range(ROUNDS):
+        for _ in iterations(look, ROUND):
+            look.solver.step()
+        light = _light(look, kept, lamps)
+        dark[lamps[light < DARK]] = True
+        lamps, light = lamps[light >= DARK], light[light >= DARK]
+        if made and not len(lamps):
+            return None
+        sure = lamps[light >= max(LAMP, FAINT * light.max(initial=0))]
+        if len(sure) and told is None:
+            told = _beyond(fastest_lamp(), sure.max(), fastest)
+        clear = len(sure) and find_patterns(host(look.solver.theta), beyond_doubt=True) is not None
+        if clear or made == ROUNDS - 1:
+            break
+        energy = residual_energy(look.predict())
+        energy[kept] = np.nan
+        ratio = np.nan_to_num(energy / np.nanmedian(energy))
+        ratio[dark] = 0
+        found = _peaks(ratio)
+        if not made and not len(found):
+            return None
+        lamps = np.concatenate([lamps, found])
+        wanted = np.union1d(_windows(lamps, fastest), _windows(NONE if told is None else told, fastest))
+        kept, look = _moved(look, kept, wanted, frames, problem, begin)
+    if told is None:
+        return None
+    # what is slower than a lamp costs little
+    lamps = np.concatenate([lamps[lamps <= sure.max(initial=0)], told])
+    return _moved(look, kept, _windows(lamps, fastest), frames, problem, begin)[1]
+
+
+def widened(
+    look: InBand, cosine: int, problem: Problem, begin: Callable[[LearnedBasis, Array | None], InBand]
+) -> InBand:
+    """A look like this one that also holds the cosines about another."""
+    basis = look.basis
+    kept = np.flatnonzero(basis.curves.any(1)) if isinstance(basis, LearnedBasis) else np.arange(basis.count)
+    fastest = max(basis.cosines, cosine + BESIDE + 1)
+    wider = np.union1d(kept, _windows(np.array([cosine]), fastest))
+    return _moved(look, kept, wider, basis.frames, problem, begin)[1]
+
+
+def _beyond(last: int, known: int, fastest: int) -> NDArray[np.int64]:
+    """Cosines whose windows hold the fastest lamp of the lines' covariance, if that is beyond the known ones.
+
+    It tells no more than the end of the lamp's peak, and of long segments as that of a part.
+    """
+    spread = 2 * BESIDE + 1
+    if not known + 2 * spread < last <= fastest - BESIDE:
+        return NONE
+    return np.array([last - 1 - spread, last - 1])
+
+
+def _windows(lamps: NDArray[np.int64], fastest: int) -> NDArray[np.int64]:
+    """The cosines to solve for, in order."""
+    kept = np.zeros(fastest, bool)
+    kept[:FEWEST_COEFFICIENTS] = True
+    for lamp in lamps:
+        kept[lamp - BESIDE : lamp + BESIDE + 1] = True
+    return np.flatnonzero(kept)
+
+
+def _basis(kept: NDArray[np.int64], frames: int, problem: Problem) -> LearnedBasis:
+    """These of the cosines; the band ends `MARGIN` beyond the fastest, as one that is searched for does."""
+    count = min(frames, round(MARGIN * (int(kept[-1]) + 1)))
+    within = TemporalBasis(frames, count, problem.arrays)
+    return LearnedBasis(within, np.eye(count)[:, kept])
+
+
+def _moved(
+    look: InBand,
+    kept: NDArray[np.int64],
+    wanted: NDArray[np.int64],
+    frames: int,
+    problem: Problem,
+    begin: Callable[[LearnedBasis, Array | None], InBand],
+) -> tuple[NDArray[np.int64], InBand]:
+    """The look with other cosines, where it is."""
+    if np.array_equal(kept, wanted):
+        return kept, look
+    theta = host(look.solver.theta)
+    moved = np.zeros((len(wanted), *theta.shape[1:]), theta.dtype)
+    _, to, of = np.intersect1d(wanted, kept, return_indices=True)
+    moved[to] = theta[of]
+    other = begin(_basis(wanted, frames, problem), problem.arrays.asarray(moved))
+    assert isinstance(other.solver, Admm)
+    assert isinstance(look.solver, Admm)
+    other.solver.adopt(look.solver)
+    return wanted, other
+
+
+def _light(look: InBand, kept: NDArray[np.int64], lamps: NDArray[np.int64]) -> NDArray[np.float64]:
+    """The largest energy about each lamp, relative to that of the faster half of the slow cosines."""
+    energy = np.square(host(look.solver.theta), dtype=np.float64).sum((1, 2))
+    usual = np.median(energy[FEWEST_COEFFICIENTS // 2 : FEWEST_COEFFICIENTS])
+    near = [energy[np.abs(kept - lamp) <= BESIDE].max() for lamp in lamps]
+    relative: NDArray[np.float64] = np.array(near) / max(usual, np.finfo(np.float64).tiny)
+    return relative
+
+
+def _peaks(ratio: NDArray[np.float64]) -> NDArray[np.int64]:
+    """The cosines that stand out most, at least a window apart."""
+    found: list[int] = []
+    left = ratio.copy()
+    while len(found) < AT_ONCE and left.max() > STANDS_OUT:
+        highest = int(left.argmax())
+        found.append(highest)
+        left[max(0, highest - BESIDE) : highest + BESIDE + 1] = 0
+    return np.array(found, np.int64)
+
+
+def _spectrum(
+    segment: Segment, problem: Problem, temporal_merge: int, count: int
+) -> Callable[[NDArray[np.float64]], NDArray[np.float64]]:
+    """The energy of what a prediction leaves of the samples, per cosine."""
+    frames = segment.geometry.video_shape(1, temporal_merge)[0]
+    merge = -(-segment.geometry.size // COARSE_SIDE)
+    operator = band_operator(
+        segment.geometry,
+        segment.code,
+        TemporalBasis(frames, count),
+        merge,
+        temporal_merge,
+        segment.alignment,
+        segment.blur,
+    )
+
+    def energy(predicted: NDArray[np.float64]) -> NDArray[np.float64]:
+        left = np.where(problem.weight > 0, problem.samples - predicted, 0).astype(np.float32)
+        each: NDArray[np.float64] = np.square(operator.adjoint(left), dtype=np.float64).sum((1, 2))
+        return each
+
+    return energy

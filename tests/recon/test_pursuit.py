@@ -1,0 +1,116 @@
+"""The first look at lamps: which cosines it keeps, and that scenes without lamps are left to the search."""
+
+from __future__ import annotations
+
+from functools import cache, partial
+from itertools import repeat
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pytest
+
+from acquire.arrays import host
+from acquire.lines import Segment
+from acquire.recon import blinking, reconstruct
+from acquire.recon.bandwidth import FEWEST_COEFFICIENTS, MARGIN
+from acquire.recon.basis import LearnedBasis, TemporalBasis
+from acquire.recon.options import SolveOptions
+from acquire.recon.problem import Problem, build_problem
+from acquire.recon.pursuit import pursue, widened
+from acquire.sim.procedural import record
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from acquire.recon.estimates import InBand
+
+OPTIONS = SolveOptions(spatial_merge=3, temporal_merge=1, solver="admm", iterations=150)
+
+
+@cache
+def posed(scene: str, seed: int) -> tuple[Segment, Problem]:
+    segment = record(scene, seed, stages=32, lines=200).segment
+    return segment, build_problem(segment, 3, 1, hold_out=0.08)
+
+
+def without_limit(_: InBand, most: int) -> Iterator[int]:
+    yield from range(most)
+
+
+def look_at(scene: str, seed: int, last_lamp: int = 0) -> InBand | None:
+    segment, problem = posed(scene, seed)
+    begin = partial(blinking._begin, segment, problem, OPTIONS)
+    return pursue(segment, problem, (3, 1), begin, without_limit, lambda: last_lamp)
+
+
+def kept(look: InBand) -> list[int]:
+    assert isinstance(look.basis, LearnedBasis)
+    return np.flatnonzero(look.basis.curves.any(axis=1)).tolist()
+
+
+def end_of_lamps(segment: Segment) -> int:
+    """Number of cosines up to the lamp of 5 kHz, the fastest of `leds`, at 100 kHz."""
+    return round(2 * segment.geometry.span * 5e3 / 1e5)
+
+
+@pytest.mark.parametrize("seed", range(61, 69))
+def test_lamps_are_found_without_the_cosines_between_them(seed: int) -> None:
+    look = look_at("leds", seed)
+    assert look is not None
+    last = end_of_lamps(posed("leds", seed)[0])
+    held = kept(look)
+    assert {*range(FEWEST_COEFFICIENTS), last - 1, last, last + 1} <= {*held}
+    assert len(held) < FEWEST_COEFFICIENTS + 25
+    # no sidelobe of the code widens the band
+    assert look.basis.cosines <= round(MARGIN * (last + 4))
+
+
+@pytest.mark.parametrize("scene", ["still", "runner", "splash", "flame", "bullet", "text"])
+@pytest.mark.parametrize("seed", [61, 62])
+def test_scenes_without_lamps_are_left_to_the_search_of_the_band(scene: str, seed: int) -> None:
+    assert look_at(scene, seed) is None
+
+
+def test_a_lamp_of_the_covariance_is_looked_at_wherever_it_is() -> None:
+    assert look_at("runner", 61, last_lamp=150) is None, "without others it is no scene of lamps"
+    look = look_at("leds", 61, last_lamp=150)
+    assert look is not None
+    assert {*range(143, 151)} <= {*kept(look)}
+
+
+def test_another_cosine_leaves_the_picture_as_it_is() -> None:
+    segment, problem = posed("leds", 61)
+    look = look_at("leds", 61)
+    assert look is not None
+    begin = partial(blinking._begin, segment, problem, OPTIONS)
+    wider = widened(look, 200, problem, begin)
+    assert {*kept(look), 198, 199, 200, 201, 202} == {*kept(wider)}
+    assert wider.basis.cosines >= 203
+    np.testing.assert_allclose(wider.video(), look.video(), atol=1e-5 * look.video().max())
+    whole = blinking._begin(segment, problem, OPTIONS, TemporalBasis(look.basis.frames, 40), None)
+    whole.solver.step()
+    beyond = widened(whole, 100, problem, begin)
+    assert kept(beyond) == [*range(40), *range(98, 103)]
+    np.testing.assert_allclose(host(beyond.solver.theta)[:40], host(whole.solver.theta))
+
+
+def test_a_look_that_may_not_iterate_ends() -> None:
+    segment, problem = posed("leds", 61)
+    begin = partial(blinking._begin, segment, problem, OPTIONS)
+    assert pursue(segment, problem, (3, 1), begin, lambda *_: iter(()), lambda: 0) is None
+
+
+def test_a_short_video_has_no_fast_cosines_to_look_for() -> None:
+    segment, problem = posed("leds", 61)
+    T_m = segment.geometry.span // 40
+    coarse = build_problem(segment, 3, T_m, hold_out=0.08)
+    assert pursue(segment, coarse, (3, T_m), lambda *_: pytest.fail("begun"), without_limit, repeat) is None
+    assert problem.held_out.any()
+
+
+def test_lamps_are_shown_better_and_sooner_than_in_the_whole_band() -> None:
+    segment, _ = posed("leds", 61)
+    lamps = reconstruct(segment, 3, 1, check=False, error=False)
+    last = end_of_lamps(segment)
+    assert lamps.parameters["patterns"] <= 5
+    assert last < lamps.parameters["temporal_coefficients"] < 1.4 * last
