@@ -161,7 +161,7 @@ def refine(
         return found
     clock.reset()
     if isinstance(found, Refined):
-        first = widened(first, beyond, problem, partial(_begin, segment, problem, options))
+        first = widened(first, beyond, partial(_begin, segment, problem, options))
     else:
         # the constant cosine is a still, of which the wider band is to find the change
         still, count = first.solver.theta[:1, ...], round(MARGIN * (beyond + 1))

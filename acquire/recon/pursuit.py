@@ -11,7 +11,8 @@ found, nothing is lost: the whole band is searched for and solved in, as for any
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Self
 
 import numpy as np
 
@@ -27,10 +28,13 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from acquire.arrays import Array
+    from acquire.arrays import Array, Arrays
     from acquire.lines import Segment
     from acquire.recon.estimates import InBand
     from acquire.recon.problem import Problem
+
+    Begin = Callable[[LearnedBasis, Array | None], InBand]
+    """Makes an estimate in a basis, from coefficients or from zero."""
 
 NONE = np.zeros(0, np.int64)
 ROUND, ROUNDS = 10, 6
@@ -55,67 +59,104 @@ def pursue(
     segment: Segment,
     problem: Problem,
     merges: tuple[int, int],
-    begin: Callable[[LearnedBasis, Array | None], InBand],
+    begin: Begin,
     iterations: Callable[[InBand, int], Iterator[int]],
     fastest_lamp: Callable[[], int],
     still: Array | None = None,
 ) -> InBand | None:
     """Look at the scene in the slow cosines and those of its lamps; None if it has none that are faster.
 
-    ``begin`` makes an estimate in a basis from coefficients, ``iterations`` yields before each that may run,
-    and ``fastest_lamp`` is the number of cosines up to the fastest lamp, as `lamps.last_lamp`, or 0.
+    ``iterations`` yields before each that may run; ``fastest_lamp`` is the number of cosines up to the
+    fastest lamp of the lines' covariance, or 0. The look starts from zero, or from the coefficients
+    (1, n′, n′) of a ``still``.
     """
     frames = segment.geometry.video_shape(*merges)[0]
     fastest = frames // 2
-    # as for the search of a band: without a margin of cosines there is nothing to stand out of
+    # as for the search of a band: few cosines have no median that lamps could stand out of
     if fastest < 2 * FEWEST_COEFFICIENTS:
         return None
     residual_energy = _spectrum(segment, problem, merges[1], fastest)
-    lamps = sure = NONE
-    told, dark = None, np.zeros(fastest, bool)
-    kept = _windows(lamps, fastest)
-    basis = _basis(kept, frames, problem)
-    look = begin(basis, None if still is None else resized(still, basis))
+    lamps, dark = NONE, np.zeros(fastest, bool)
+    sure, told = NONE, None
+    look = _Look.at_start(begin, _windows(lamps, fastest), frames, problem.arrays, still)
     for made in range(ROUNDS):
-        for _ in iterations(look, ROUND):
-            look.solver.step()
-        light = _light(look, kept, lamps)
+        for _ in iterations(look.estimate, ROUND):
+            look.estimate.solver.step()
+        light = look.light(lamps)
         dark[lamps[light < DARK]] = True
         lamps, light = lamps[light >= DARK], light[light >= DARK]
         if made and not len(lamps):
             return None
         sure = lamps[light >= max(LAMP, FAINT * light.max(initial=0))]
-        if len(sure) and told is None:
+        if told is None and len(sure):
             told = _beyond(fastest_lamp(), sure.max(), fastest)
-        clear = len(sure) and find_patterns(host(look.solver.theta), beyond_doubt=True) is not None
-        if clear or made == ROUNDS - 1:
+        if made == ROUNDS - 1 or (len(sure) and look.is_clear):
             break
-        energy = residual_energy(look.predict())
-        energy[kept] = np.nan
-        ratio = np.nan_to_num(energy / np.nanmedian(energy))
-        ratio[dark] = 0
+        energy = residual_energy(look.estimate.predict())
+        usual = np.median(np.delete(energy, look.kept))
+        ratio = energy / max(usual, np.finfo(np.float64).tiny)
+        ratio[look.kept] = ratio[dark] = 0
         found = _peaks(ratio)
         if not made and not len(found):
             return None
         lamps = np.concatenate([lamps, found])
-        wanted = np.union1d(_windows(lamps, fastest), _windows(NONE if told is None else told, fastest))
-        kept, look = _moved(look, kept, wanted, frames, problem, begin)
-    if told is None:
+        look = look.moved(_windows(np.concatenate([lamps, NONE if told is None else told]), fastest))
+    if told is None or not len(sure):
         return None
     # what is slower than a lamp costs little
-    lamps = np.concatenate([lamps[lamps <= sure.max(initial=0)], told])
-    return _moved(look, kept, _windows(lamps, fastest), frames, problem, begin)[1]
+    lamps = np.concatenate([lamps[lamps <= sure.max()], told])
+    return look.moved(_windows(lamps, fastest)).estimate
 
 
-def widened(
-    look: InBand, cosine: int, problem: Problem, begin: Callable[[LearnedBasis, Array | None], InBand]
-) -> InBand:
+def widened(look: InBand, cosine: int, begin: Begin) -> InBand:
     """A look like this one that also holds the cosines about another."""
     basis = look.basis
     kept = np.flatnonzero(basis.curves.any(1)) if isinstance(basis, LearnedBasis) else np.arange(basis.count)
-    fastest = max(basis.cosines, cosine + BESIDE + 1)
-    wider = np.union1d(kept, _windows(np.array([cosine]), fastest))
-    return _moved(look, kept, wider, basis.frames, problem, begin)[1]
+    near = _windows(np.array([cosine]), cosine + BESIDE + 1)
+    return _Look(look, kept, begin).moved(np.union1d(kept, near)).estimate
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Look:
+    """An estimate in the cosines ``kept``; ``begin`` makes one in any basis."""
+
+    estimate: InBand
+    kept: NDArray[np.int64]
+    begin: Begin
+
+    @classmethod
+    def at_start(
+        cls, begin: Begin, kept: NDArray[np.int64], frames: int, arrays: Arrays, still: Array | None
+    ) -> Self:
+        basis = _basis(kept, frames, arrays)
+        return cls(begin(basis, None if still is None else resized(still, basis)), kept, begin)
+
+    @property
+    def is_clear(self) -> bool:
+        """Whether the scene is evidently a sum of a few patterns."""
+        return find_patterns(host(self.estimate.solver.theta), beyond_doubt=True) is not None
+
+    def moved(self, wanted: NDArray[np.int64]) -> _Look:
+        """The same light in other cosines, as far as these hold it."""
+        if np.array_equal(self.kept, wanted):
+            return self
+        theta, basis = host(self.estimate.solver.theta), self.estimate.basis
+        moved = np.zeros((len(wanted), *theta.shape[1:]), theta.dtype)
+        _, to, of = np.intersect1d(wanted, self.kept, return_indices=True)
+        moved[to] = theta[of]
+        other = self.begin(_basis(wanted, basis.frames, basis.arrays), basis.arrays.asarray(moved))
+        assert isinstance(other.solver, Admm)
+        assert isinstance(self.estimate.solver, Admm)
+        other.solver.adopt(self.estimate.solver)
+        return _Look(other, wanted, self.begin)
+
+    def light(self, lamps: NDArray[np.int64]) -> NDArray[np.float64]:
+        """The largest energy about each lamp, relative to that of the faster half of the slow cosines."""
+        energy = np.square(host(self.estimate.solver.theta), dtype=np.float64).sum((1, 2))
+        usual = np.median(energy[FEWEST_COEFFICIENTS // 2 : FEWEST_COEFFICIENTS])
+        near = [energy[np.abs(self.kept - lamp) <= BESIDE].max() for lamp in lamps]
+        relative: NDArray[np.float64] = np.array(near) / max(usual, np.finfo(np.float64).tiny)
+        return relative
 
 
 def _beyond(last: int, known: int, fastest: int) -> NDArray[np.int64]:
@@ -138,42 +179,10 @@ def _windows(lamps: NDArray[np.int64], fastest: int) -> NDArray[np.int64]:
     return np.flatnonzero(kept)
 
 
-def _basis(kept: NDArray[np.int64], frames: int, problem: Problem) -> LearnedBasis:
+def _basis(kept: NDArray[np.int64], frames: int, arrays: Arrays) -> LearnedBasis:
     """These of the cosines; the band ends `MARGIN` beyond the fastest, as one that is searched for does."""
     count = min(frames, round(MARGIN * (int(kept[-1]) + 1)))
-    within = TemporalBasis(frames, count, problem.arrays)
-    return LearnedBasis(within, np.eye(count)[:, kept])
-
-
-def _moved(
-    look: InBand,
-    kept: NDArray[np.int64],
-    wanted: NDArray[np.int64],
-    frames: int,
-    problem: Problem,
-    begin: Callable[[LearnedBasis, Array | None], InBand],
-) -> tuple[NDArray[np.int64], InBand]:
-    """The look with other cosines, where it is."""
-    if np.array_equal(kept, wanted):
-        return kept, look
-    theta = host(look.solver.theta)
-    moved = np.zeros((len(wanted), *theta.shape[1:]), theta.dtype)
-    _, to, of = np.intersect1d(wanted, kept, return_indices=True)
-    moved[to] = theta[of]
-    other = begin(_basis(wanted, frames, problem), problem.arrays.asarray(moved))
-    assert isinstance(other.solver, Admm)
-    assert isinstance(look.solver, Admm)
-    other.solver.adopt(look.solver)
-    return wanted, other
-
-
-def _light(look: InBand, kept: NDArray[np.int64], lamps: NDArray[np.int64]) -> NDArray[np.float64]:
-    """The largest energy about each lamp, relative to that of the faster half of the slow cosines."""
-    energy = np.square(host(look.solver.theta), dtype=np.float64).sum((1, 2))
-    usual = np.median(energy[FEWEST_COEFFICIENTS // 2 : FEWEST_COEFFICIENTS])
-    near = [energy[np.abs(kept - lamp) <= BESIDE].max() for lamp in lamps]
-    relative: NDArray[np.float64] = np.array(near) / max(usual, np.finfo(np.float64).tiny)
-    return relative
+    return LearnedBasis(TemporalBasis(frames, count, arrays), np.eye(count)[:, kept])
 
 
 def _peaks(ratio: NDArray[np.float64]) -> NDArray[np.int64]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
+import tracemalloc
 from dataclasses import replace
 from functools import cache
 from types import SimpleNamespace
@@ -23,6 +24,7 @@ from acquire.recon.error import (
     combined_facts,
     error_from,
     in_regions,
+    measure_indicators,
     regions_of,
 )
 from acquire.showing import error_in_words
@@ -39,6 +41,26 @@ def recorded(scene: str, stages: int = 24, lines: int = 120) -> Recorded:
 @cache
 def solved(scene: str) -> Reconstruction:
     return reconstruct(recorded(scene).segment, 3, 1, "fast")
+
+
+def test_indicators_of_a_long_video_take_little_memory() -> None:
+    rng = np.random.default_rng(1)
+    video, other = rng.random((2, 1500, 40, 40), np.float32)
+    tracemalloc.start()
+    found = measure_indicators(video, other, 0.1, slice(100, 1400), BY_LINES)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    # a large sensor's video is a gigabyte, and every copy of it another one
+    assert peak < video.nbytes
+    assert found is not None
+    np.testing.assert_allclose(found.sensitivity**2, in_regions(np.square(other - video)), rtol=1e-4)
+    shown = video[100:1400]
+    spread = in_regions(np.square(shown - shown.mean(0))).mean(0)
+    np.testing.assert_allclose(found.change**2, spread, rtol=1e-4)
+    edge = np.zeros_like(shown)
+    edge[:, :-1] += np.square(np.diff(shown, axis=1))
+    edge[:, :, :-1] += np.square(np.diff(shown, axis=2))
+    np.testing.assert_allclose(found.edge**2, in_regions(edge).mean(0), rtol=1e-4)
 
 
 @pytest.mark.parametrize("scene", ["splash", "leds", "runner"])

@@ -109,6 +109,25 @@ def test_a_learnt_prior_keeps_noise_out_of_the_curves_and_leaves_exact_lines_alo
     assert error(exact, learns=True) < 2e-3
 
 
+def test_light_at_cosines_that_were_not_solved_for_is_found_by_the_curves() -> None:
+    """A first look at lamps leaves the cosines between them at 0, of which no prior may be made."""
+    cosines, rng = TemporalBasis(GEOMETRY.span, 40), np.random.default_rng(5)
+    wanted = cosines.analyze(LIGHT.T)
+    exact = segment(np.tensordot(cosines.synthesize(wanted), IMAGES, 1))
+    noise = 0.01 * exact.lines.max() * rng.standard_normal(exact.lines.shape).astype(np.float32)
+    noisy = replace(exact, lines=exact.lines + noise)
+    problem = build_problem(noisy, 1, 1, hold_out=0.0)
+    fit = CurveFit(noisy, problem, cosines, 1, learns=True)
+    curves = wanted / problem.scale
+    # from the fifth to the eighth strongest
+    gap = np.isin(np.arange(40), np.argsort(np.square(wanted).sum(1))[-8:-4])
+    curves[gap] = 0
+    for _ in range(12):
+        curves = fit(IMAGES, curves)
+    missed = np.linalg.norm((curves * problem.scale - wanted)[gap]) / np.linalg.norm(wanted[gap])
+    assert missed < 0.3
+
+
 def test_a_pattern_too_many_is_recognised_and_one_of_the_scene_is_not() -> None:
     problem, cosines = build_problem(segment(), 3, 1, hold_out=0.08), TemporalBasis(GEOMETRY.span, 40)
     curves, size = np.linalg.qr(cosines.analyze(LIGHT.T))
