@@ -56,9 +56,22 @@ class Prior:
 LADDER = tuple(
     Prior(length, change, fast, 1e-3)
     for length in (0.02, 0.06, 0.2)
-    for change, fast in ((1e-4, 1.0), (0.03, 3.0), (0.3, 3.0), (1.0, 3.0), (0.03, 40.0), (0.3, 40.0))
+    for change, fast in (
+        (1e-4, 1.0),
+        (0.03, 3.0),
+        (0.3, 3.0),
+        (1.0, 3.0),
+        (0.03, 40.0),
+        (0.3, 40.0),
+        (0.01, np.inf),
+    )
 )
-"""From a fine still to a smooth and fast scene; the noise of each is the best of `NOISES`."""
+"""From a fine still to a smooth and fast scene; the noise of each is the best of `NOISES`.
+
+Light that blinks at a steady rate has its changes in a few cosines, high ones in a long segment, where the
+spectra that fall have none left. The last one expects any rate alike: its cosines together have about as much
+light as there is at rest, as if it blinked on and off.
+"""
 NOISES = (1e-5, 1e-4, 1e-3, 1e-2, 1e-1)
 
 

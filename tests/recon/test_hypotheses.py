@@ -9,12 +9,15 @@ import pytest
 from scipy.ndimage import gaussian_filter
 
 from acquire.alignment import Alignment
-from acquire.codes import mix_seed, prbs
+from acquire.codes import PrbsCode, mix_seed, prbs
+from acquire.config import load_scene
 from acquire.forward import DualArm
 from acquire.geometry import Geometry
-from acquire.lines import Segment
+from acquire.lines import ARMS, Segment
 from acquire.recon.hypotheses import AS_BUILT, TURNS, Hypothesis, LineModel, Turn, compare
 from acquire.recon.search import Inquiry, Standing, inquire
+from acquire.sim.lines import StreamingArm
+from acquire.sim.scenes import build_scene
 
 GEOMETRY = Geometry(24, 3, 120)
 
@@ -56,6 +59,23 @@ def test_a_right_description_is_confirmed() -> None:
     inquiry = found(recorded())
     assert inquiry.standing is Standing.RIGHT
     assert inquiry.best is inquiry.described
+
+
+def test_lamps_that_blink_fast_for_a_large_sensor_follow_their_code() -> None:
+    """Fig. 9 on 96 stages: the fastest lamp is near the highest of the cosines in its long segment."""
+    geometry, code = Geometry(96, 3, 392), PrbsCode.from_seed(64, 1)
+    scene = build_scene(load_scene("scene-leds"), geometry.size, 1e-5)
+    arms = [StreamingArm(scene, code, geometry.stages, geometry.substeps, arm) for arm in ARMS]
+    exact = np.stack([arm.lines(0, geometry.lines) for arm in arms])
+    noise = 0.006 * exact.max() * np.random.default_rng(1).standard_normal(exact.shape)
+    segment = Segment(
+        lines=exact + noise,
+        mask=np.ones(geometry.lines_shape, bool),
+        code=code.bits(0, geometry.span),
+        geometry=geometry,
+        time_ns=np.arange(geometry.lines, dtype=np.int64) * 30_000,
+    )
+    assert found(segment).standing is Standing.RIGHT
 
 
 def test_a_late_code_is_named_to_the_substep() -> None:
