@@ -178,23 +178,27 @@ class Recorder(Device, Stageable, Preparable, Flyable, Collectable, WritesStream
             # First, so that `complete`, which may still be waiting, does not report this stop as a failure.
             self._staged, armed, self._armed = False, self._armed, False
             try:
-                while True:
-                    status, account = await self._client.status(), self._account
-                    ours = (
-                        account is not None
-                        and status.recording is not None
-                        and await self._update_account(account, status)
-                    )
-                    # Sealing is waited for: the daemon refuses to disarm in this state.
-                    if not ours and status.state is not State.DRAINING:
-                        break
-                    if status.state is State.RECORDING:
-                        await self._stop()
-                    await asyncio.sleep(POLL_S)
-                if armed and status.state is State.ARMED:
-                    await self._client.disarm()
+                await self._stop_recording(disarm=armed)
             except NoDaemonError as error:
                 log.warning("%s: there is nothing left to stop: %s", self.name, error)
+
+    async def _stop_recording(self, *, disarm: bool) -> None:
+        """Stop the plan's recording, wait until none is being sealed, and disarm."""
+        while True:
+            status, account = await self._client.status(), self._account
+            ours = (
+                account is not None
+                and status.recording is not None
+                and await self._update_account(account, status)
+            )
+            # Sealing is waited for: the daemon refuses to disarm in this state.
+            if not ours and status.state is not State.DRAINING:
+                break
+            if status.state is State.RECORDING:
+                await self._stop()
+            await asyncio.sleep(POLL_S)
+        if disarm and status.state is State.ARMED:
+            await self._client.disarm()
 
     async def _stop(self) -> None:
         """Stop the recording, unless it has ended since the last status."""

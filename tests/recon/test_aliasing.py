@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from acquire.evaluate.metrics import psnr
 from acquire.forward import DualArm
 from acquire.recon import Reconstruction, reconstruct
 from acquire.recon.aliasing import detect_unresolved_light
@@ -20,12 +21,21 @@ def told(warnings: tuple[str, ...]) -> list[str]:
 
 
 def test_a_lamp_of_20_khz_is_reported_with_its_frequency() -> None:
-    result = reconstruct(record("fastled", 22, **SIZES).segment, 3, 1)
+    result = reconstruct(record("fastled", 23, **SIZES).segment, 3, 1)
     (words,) = told(result.warnings)
     found_hz = float(words.removeprefix("light changes at about ").split()[0])
     assert found_hz == pytest.approx(20e3, rel=0.01)
     assert result.parameters["resolved_hz"] < 10e3
     assert f"the {result.parameters['resolved_hz']:.5g} Hz that" in words
+
+
+def test_a_lamp_of_20_khz_that_stands_out_of_the_residual_is_shown() -> None:
+    recorded = record("fastled", 22, **SIZES)
+    result = reconstruct(recorded.segment, 3, 1, error=False)
+    assert not told(result.warnings)
+    assert result.parameters["resolved_hz"] > 20e3
+    # 20 dB if it is shown as steady
+    assert psnr(result.video[result.trusted], recorded.truth(3, 1)) > 28
 
 
 def held_against(recorded: Recorded, result: Reconstruction, clock: IterationClock) -> tuple[str, ...]:
