@@ -17,16 +17,14 @@ iteration is over-relaxed by 1.7 (Eckstein and Bertsekas, Math. Program. 55, 293
 
 from __future__ import annotations
 
-import math
 from copy import copy
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
-
-from array_api_compat import is_numpy_array
+from typing import TYPE_CHECKING
 
 from acquire.arrays import dot, namespace
 from acquire.errors import NumericsError
 from acquire.recon.denoisers import Checked
+from acquire.recon.sign import SignSplit
 from acquire.recon.tv import FrameTv
 
 if TYPE_CHECKING:
@@ -36,10 +34,6 @@ if TYPE_CHECKING:
     from acquire.recon.basis import Basis
     from acquire.recon.denoisers import Denoiser
     from acquire.recon.problem import MaskedOperator
-
-PART_PIXELS, PART_ROWS = 1 << 19, 4
-"""Pixels of the instants that are handled together, 2 MB; and the fewest instants, relative to the number of
-coefficient frames: the product of fewer spends more time on the frames than on the instants."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -90,21 +84,19 @@ class Admm:
         denoiser: Denoiser | None = None,
         background: Array | None = None,
     ) -> None:
-        self._samples, self._parameters, self._background = samples, parameters, background
+        self._samples, self._parameters = samples, parameters
         tv = FrameTv(parameters.tv_iterations, joint=parameters.joint_tv)
         self._denoiser = Checked(denoiser) if denoiser else tv
         self._xp, arrays = namespace(samples), basis.arrays
         self._emphasis = arrays.asarray(emphasis)
         # λ/ρ per frame: the split's prox has λ·TV over ρ/2·‖·‖²
         self._strength = self._emphasis * (parameters.tv_weight / parameters.tv_penalty)
-        # before `rebase`, which lifts it
-        self._w = arrays.zeros(samples.shape)
-        self.rebase(operator, basis, arrays.zeros(theta_shape) if start is None else start)
+        self._operator = operator
+        self.theta = arrays.zeros(theta_shape) if start is None else arrays.asarray(start)
+        self._w, self._lifted = arrays.zeros(samples.shape), arrays.zeros(theta_shape)
         self._tv_multiplier = arrays.zeros(theta_shape)
-        # The split of the sign, max(·, 0), plus its multiplier over ρ, min(·, 0): one is 0 where the other is
-        # not, so that their sum tells both. Over all instants it is by far the largest array of a solver for
-        # few patterns. It begins at the start, not at 0, which would draw a warm start to darkness.
-        self._signed = self._xp.maximum(self._whole(self.theta, slice(None)), 0)
+        self._sign = SignSplit(self._grid(basis), self.theta, background)
+        self._prepare()
 
     def rebase(self, operator: MaskedOperator, basis: Basis, theta: Array) -> None:
         """Continue in another basis with the same number of rows and cosines, close to the last one.
@@ -113,24 +105,17 @@ class Admm:
         follow slowly.
         """
         self._operator, self.theta = operator, basis.arrays.asarray(theta)
-        # in cosines, also for a basis of fewer curves: on fewer instants its rows would not be orthonormal
-        grid = min(basis.frames, self._parameters.grid_per_coefficient * basis.cosines)
-        self._grid = basis.arrays.asarray(basis.matrix(grid))
-        background = self._background
-        self._known = None if background is None else self._xp.tensordot(self._grid.T, background, axes=1)
         self._lifted = operator.adjoint(self._w)  # BᵀW·w
-        self._instants = self._in_parts(self._grid.shape[1])
+        self._sign.rebase(self._grid(basis), self.theta.shape)
         self._prepare()
 
-    def _in_parts(self, instants: int) -> list[slice]:
-        """Slices of the instants whose temporary arrays are small, where that costs no time.
+    def _grid(self, basis: Basis) -> Array:
+        """The basis at the instants of the sign's split, in cosines also for a basis of fewer curves.
 
-        A product of many rows is slower in parts, and so is everything on other devices.
+        On fewer instants its rows would not be orthonormal.
         """
-        rows, *frame = self.theta.shape
-        at_once = max(PART_PIXELS // math.prod(frame), PART_ROWS * rows)
-        step = at_once if is_numpy_array(self.theta) else instants
-        return [slice(first, first + step) for first in range(0, instants, step)]
+        instants = min(basis.frames, self._parameters.grid_per_coefficient * basis.cosines)
+        return basis.arrays.asarray(basis.matrix(instants))
 
     def reweigh(self, parameters: AdmmParameters) -> None:
         """Continue with other weights; what is stored divided by ρ, multipliers and w, keeps its value."""
@@ -138,9 +123,7 @@ class Admm:
         self._w *= old.penalty / parameters.penalty
         self._lifted *= old.penalty / parameters.penalty
         self._tv_multiplier *= old.tv_penalty / parameters.tv_penalty
-        for some in self._instants:
-            signed = self._signed[some, ...]
-            self._signed[some, ...] = _rescaled(self._xp, signed, old.sign_penalty / parameters.sign_penalty)
+        self._sign.rescale(old.sign_penalty / parameters.sign_penalty)
         self._strength = self._emphasis * (parameters.tv_weight / parameters.tv_penalty)
         self._prepare()
 
@@ -151,7 +134,8 @@ class Admm:
         self.adopt(other)
         self._tv_multiplier = other._tv_multiplier * (old.tv_penalty / new.tv_penalty)
         # the splits are in units of θ; only multipliers are divided by ρ
-        self._signed = _rescaled(self._xp, other._signed, old.sign_penalty / new.sign_penalty)
+        self._sign.resume(other._sign)
+        self._sign.rescale(old.sign_penalty / new.sign_penalty)
 
     def adopt(self, other: Admm) -> None:
         """Take over w, which belongs to the lines, from a solver in any basis."""
@@ -170,7 +154,7 @@ class Admm:
         other._strength = self._strength * heavier
         other._samples, other._operator = samples, operator
         other._tv_multiplier = self._xp.asarray(self._tv_multiplier, copy=True)
-        other._signed = self._xp.asarray(self._signed, copy=True)
+        other._sign = self._sign.copied()
         other._w = self._xp.asarray(self._w, copy=True)
         other._lifted = operator.adjoint(other._w)
         other._prepare()
@@ -195,10 +179,7 @@ class Admm:
         relaxed = self._data_step()
         relaxed *= relaxation
         relaxed += (1 - relaxation) * self.theta
-        for some in self._instants:
-            values = self._whole(relaxed, some)
-            values += self._xp.minimum(self._signed[some, ...], 0)
-            self._signed[some, ...] = values
+        self._sign.advance(relaxed)
         self.theta = self._denoiser.prox(relaxed + self._tv_multiplier, self._strength)
         relaxed -= self.theta
         self._tv_multiplier += relaxed
@@ -209,14 +190,7 @@ class Admm:
         # the grid's rows are orthonormal, so that both splits together are one ρ/2·‖θ − centre‖²
         centre = self.theta - self._tv_multiplier
         centre *= p.tv_penalty
-        for some in self._instants:
-            # the split minus its multiplier
-            reflected = self._xp.abs(self._signed[some, ...])
-            if self._known is not None:
-                reflected -= self._known[some, ...]
-            pull = self._xp.tensordot(self._grid[:, some], reflected, axes=1)
-            pull *= p.sign_penalty
-            centre += pull
+        centre += p.sign_penalty * self._sign.pull()
         centre /= rho
         # y − W·B·c − (W·B·BᵀW + ρ)·w, with a single product, since `_lifted` is BᵀW·w
         residual = self._samples - self._operator.forward(centre + self._lifted) - rho * self._w
@@ -228,11 +202,6 @@ class Admm:
         self._descend(residual, rho)
         centre += self._lifted
         return centre
-
-    def _whole(self, theta: Array, some: slice) -> Array:
-        """The light of coefficients and background, which is not negative, at some of the grid's instants."""
-        values = self._xp.tensordot(self._grid[:, some].T, theta, axes=1)
-        return values if self._known is None else values + self._known[some, ...]
 
     def _descend(self, residual: Array, rho: float) -> None:
         """Make conjugate-gradient steps on (W·B·BᵀW + ρ)·w; ``residual`` is overwritten."""
@@ -259,8 +228,3 @@ class Admm:
             if energy <= enough:
                 return
             direction = scaled + (energy / before) * direction
-
-
-def _rescaled(xp: Any, signed: Array, factor: float) -> Array:
-    """The sum of a split and its multiplier, with the multiplier times ``factor``."""
-    return xp.maximum(signed, 0) + xp.minimum(signed, 0) * factor

@@ -25,6 +25,9 @@ SMALLEST_WEIGHT = 1e-12
 """Weight below which the prox is the identity: it changes no pixel by more than 4·λ, and 1/λ² would
 overflow."""
 
+SIGN_PIXELS = 1024
+"""Pixels of all coefficients that are handled together: they stay in a core's nearest cache."""
+
 # without nnan and ninf: solvers notice that they diverge by values that are not finite
 _FAST = {"contract", "reassoc", "nsz", "arcp"}
 
@@ -290,3 +293,58 @@ def _volume_dual_step(
 volume_prox = numba.njit(_volume_prox, cache=True, fastmath=_FAST)
 volume_prox_parallel = numba.njit(_volume_prox, parallel=True, cache=True, fastmath=_FAST)
 """As `volume_prox`, for volumes so large that three synchronisations of threads per iteration pay off."""
+
+
+@numba.njit(parallel=True, cache=True, fastmath=_FAST)
+def sign_advance(
+    theta: NDArray[Any], grid: NDArray[Any], scale: float, signed: NDArray[Any], pulled: NDArray[Any]
+) -> None:
+    """signed[t] = Σ_k grid[k, t]·theta[k] + scale·min(signed[t], 0) for coefficients (k, r, c).
+
+    ``pulled`` becomes what `sign_pull` would make of the result with a scale of 1.
+    """
+    count, instants = grid.shape
+    rows, columns = theta.shape[1:]
+    zero, scale = signed.dtype.type(0), signed.dtype.type(scale)
+    at_once = max(1, SIGN_PIXELS // columns)
+    for block in numba.prange(-(-rows // at_once)):
+        first, last = block * at_once, min((block + 1) * at_once, rows)
+        reflected = np.empty(columns, signed.dtype)
+        pulled[:, first:last] = zero
+        for t in range(instants):
+            for r in range(first, last):
+                values = signed[t, r]
+                for c in range(columns):
+                    values[c] = scale * min(values[c], zero)
+                for k in range(count):
+                    weight, light = grid[k, t], theta[k, r]
+                    for c in range(columns):
+                        values[c] += weight * light[c]
+                for c in range(columns):
+                    reflected[c] = abs(values[c])
+                for k in range(count):
+                    weight, total = grid[k, t], pulled[k, r]
+                    for c in range(columns):
+                        total[c] += weight * reflected[c]
+
+
+@numba.njit(parallel=True, cache=True, fastmath=_FAST)
+def sign_pull(signed: NDArray[Any], scale: float, grid: NDArray[Any], out: NDArray[Any]) -> None:
+    """out[k] = Σ_t grid[k, t]·(max(signed[t], 0) − scale·min(signed[t], 0)) for coefficients (k, r, c)."""
+    count, instants = grid.shape
+    rows, columns = out.shape[1:]
+    zero, scale = signed.dtype.type(0), signed.dtype.type(scale)
+    at_once = max(1, SIGN_PIXELS // columns)
+    for block in numba.prange(-(-rows // at_once)):
+        first, last = block * at_once, min((block + 1) * at_once, rows)
+        reflected = np.empty(columns, signed.dtype)
+        out[:, first:last] = zero
+        for t in range(instants):
+            for r in range(first, last):
+                values = signed[t, r]
+                for c in range(columns):
+                    reflected[c] = max(values[c], zero) - scale * min(values[c], zero)
+                for k in range(count):
+                    weight, total = grid[k, t], out[k, r]
+                    for c in range(columns):
+                        total[c] += weight * reflected[c]
