@@ -19,6 +19,8 @@ from acquire.recon.basis import TemporalBasis
 from acquire.recon.curves import CurveOperator
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from numpy.typing import NDArray
 
     from acquire.lines import Segment
@@ -84,6 +86,17 @@ def detect_unresolved_light(
     return (
         f"light changes at about {highest * rate_hz / (2 * span):.5g} Hz, faster than the "
         f"{resolved_hz:.5g} Hz that this reconstruction resolves: the video shows it as steady or too slow",
+    )
+
+
+def name_gaps(bands_hz: Sequence[tuple[float, float]]) -> tuple[str, ...]:
+    """Return a sentence if a video holds light of some bands only, and nothing of what lies between them."""
+    if len(bands_hz) < 2:
+        return ()
+    *others, last = [f"{low:.0f} to {high:.0f}" for low, high in bands_hz]
+    return (
+        f"the video holds changes of {', '.join(others)} and {last} Hz only, where lamps were found: a "
+        "bandwidth (reconstruct(bandwidth=)) admits all slower ones, with more noise",
     )
 
 

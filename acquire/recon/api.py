@@ -12,7 +12,7 @@ from acquire.arrays import Dtype, open_arrays
 from acquire.cores import granted_threads, idle_cores, limit_blas, limit_threads
 from acquire.errors import UsageError
 from acquire.lines import Segment
-from acquire.recon.aliasing import detect_unresolved_light
+from acquire.recon.aliasing import detect_unresolved_light, name_gaps
 from acquire.recon.balance import balance_of, divided
 from acquire.recon.clock import IterationClock
 from acquire.recon.denoisers import open_denoiser
@@ -205,10 +205,12 @@ class _Run:
         check = check and self.options.static_image is None and clock.ended != "stopped"
         checked = check_description(segment, quality, clock) if check else DescriptionCheck()
         facts = estimate.facts()
-        # solvers without a band are free in every frame
-        cosines = facts.get("temporal_coefficients", len(video))
         # K cosines over a span resolve K/(2·span)
-        resolved_hz = cosines / (2e-9 * segment.substep_ns * T_m * len(video))
+        cosine_hz = 1 / (2e-9 * segment.substep_ns * T_m * len(video))
+        # solvers without a band are free in every frame
+        whole = [(0, facts.get("temporal_coefficients", len(video)))]
+        bands_hz = [(a * cosine_hz, b * cosine_hz) for a, b in facts.pop("bands", whole)]
+        resolved_hz = bands_hz[-1][1]
         unresolved: tuple[str, ...] = ()
         if check and checked.believed:
             unresolved = detect_unresolved_light(
@@ -244,7 +246,7 @@ class _Run:
             ended=clock.ended,
             believed=checked.believed,
             masked=problem.masked_by,
-            warnings=(*warnings, *checked.warnings, *unresolved, *clock.shortcuts),
+            warnings=(*warnings, *checked.warnings, *unresolved, *name_gaps(bands_hz), *clock.shortcuts),
             parameters={
                 "spatial_merge": self.options.spatial_merge,
                 "temporal_merge": T_m,
@@ -252,5 +254,6 @@ class _Run:
                 **self.solver.model_dump(mode="json"),
                 **facts,
                 "resolved_hz": resolved_hz,
+                "resolved_bands_hz": bands_hz,
             },
         )

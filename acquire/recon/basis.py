@@ -36,6 +36,11 @@ class Basis(Protocol):
         ...
 
     @property
+    def held(self) -> NDArray[np.int64]:
+        """Those of the cosines that any row contains: the video holds no light of the others."""
+        ...
+
+    @property
     def arrays(self) -> Arrays:
         """Library and device of coefficients and videos; D itself is on the host, in their dtype."""
         ...
@@ -64,6 +69,7 @@ class TemporalBasis:
                 possible=f"1 to {frames} (frames of the segment)",
             )
         self.frames, self.count, self.cosines, self.arrays = frames, count, count, arrays
+        self.held = np.arange(count)
 
     def matrix(self, grid: int | None = None) -> NDArray[Any]:
         """D (K, grid) at ``grid`` ≥ K equidistant instants of the span (default: the frames)."""
@@ -104,7 +110,7 @@ class LearnedBasis:
     def __init__(self, within: TemporalBasis, curves: NDArray[Any]) -> None:
         self._within, self.curves = within, curves.astype(within.arrays.dtype)
         self.frames, self.count, self.arrays = within.frames, curves.shape[1], within.arrays
-        self.cosines = within.count
+        self.cosines, self.held = within.count, np.flatnonzero(curves.any(1))
 
     def matrix(self, grid: int | None = None) -> NDArray[Any]:
         """D (R, grid)."""

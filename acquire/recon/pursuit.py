@@ -110,8 +110,7 @@ def pursue(
 
 def widened(look: InBand, cosine: int, begin: Begin) -> InBand:
     """A look like this one that also holds the cosines about another."""
-    basis = look.basis
-    kept = np.flatnonzero(basis.curves.any(1)) if isinstance(basis, LearnedBasis) else np.arange(basis.count)
+    kept = look.basis.held
     near = _windows(np.array([cosine]), cosine + BESIDE + 1)
     return _Look(look, kept, begin).moved(np.union1d(kept, near)).estimate
 

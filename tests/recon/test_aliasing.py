@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
+from scipy.fft import dct
 
 from acquire.evaluate.metrics import psnr
 from acquire.forward import DualArm
 from acquire.recon import Reconstruction, reconstruct
-from acquire.recon.aliasing import detect_unresolved_light
+from acquire.recon.aliasing import detect_unresolved_light, name_gaps
 from acquire.recon.clock import IterationClock
 from acquire.recon.problem import build_problem
 from acquire.sim.procedural import Recorded, record
@@ -55,3 +58,26 @@ def test_nothing_is_reported_for_scenes_without_fast_light(scene: str) -> None:
     recorded = record(scene, 22, **SIZES)
     result = reconstruct(recorded.segment, 3, 1, "fast", iterations=20, check=False)
     assert not held_against(recorded, result, IterationClock(1))
+
+
+def test_the_bands_of_lamps_are_named_where_a_video_holds_nothing_between_them() -> None:
+    recorded = record("leds_dot", 62, **SIZES)
+    result = reconstruct(recorded.segment, 3, 1, error=False)
+    bands = result.parameters["resolved_bands_hz"]
+    assert len(bands) > 1, "a dot that moves is no sum of patterns"
+    assert bands[0][0] == 0
+    assert result.parameters["resolved_hz"] == bands[-1][1]
+    spectrum = np.square(dct(result.video, axis=0, norm="ortho")).sum((1, 2))
+    hz = np.arange(len(spectrum)) / len(spectrum) / (2e-9 * recorded.segment.substep_ns)
+    for (_, end), (begin, _) in pairwise(bands):
+        between = (hz > end) & (hz < begin)
+        # negative light is cut off, which adds a little
+        assert spectrum[between].sum() < 0.02 * spectrum[1:].sum()
+    (words,) = [each for each in result.warnings if each.startswith("the video holds changes of")]
+    assert f"{bands[-1][0]:.0f} to {bands[-1][1]:.0f} Hz only" in words
+
+
+def test_a_band_without_gaps_is_no_warning() -> None:
+    assert name_gaps([(0.0, 5000.0)]) == ()
+    result = reconstruct(record("splash", 62, **SIZES).segment, 3, 1, "fast", check=False, error=False)
+    assert result.parameters["resolved_bands_hz"] == [(0, result.parameters["resolved_hz"])]
