@@ -57,14 +57,33 @@ def detect_unresolved_light(
     resolved_hz: float,
     clock: IterationClock,
 ) -> tuple[str, ...]:
-    """Return a sentence if light of one frequency beyond ``resolved_hz`` stands out of the residual.
+    """Return a sentence if light of one frequency beyond ``resolved_hz`` stands out of the residual."""
+    found_hz = unresolved_hz(segment, problem, predicted, video, resolved_hz=resolved_hz, clock=clock)
+    if found_hz is None:
+        return ()
+    return (
+        f"light changes at about {found_hz:.5g} Hz, faster than the {resolved_hz:.5g} Hz that this "
+        "reconstruction resolves: the video shows it as steady or too slow",
+    )
 
-    ``predicted`` is as `Problem.samples`, ``video`` (frames, n′, n′) in any unit. Nothing is returned if
+
+def unresolved_hz(
+    segment: Segment,
+    problem: Problem,
+    predicted: NDArray[Any],
+    video: NDArray[Any],
+    *,
+    resolved_hz: float,
+    clock: IterationClock,
+) -> float | None:
+    """Return the frequency beyond ``resolved_hz`` that stands out of the residual most, if one does.
+
+    ``predicted`` is as `Problem.samples`, ``video`` (frames, n′, n′) in any unit. None is returned also if
     there is no time for the search, or if the segment is long.
     """
     span = segment.geometry.span
     if span > LARGEST_SPAN or not clock.affords(SECONDS * (span / SPAN) ** 3):
-        return ()
+        return None
     rate_hz = 1e9 / segment.substep_ns
     # cosine k of the sub-steps is light of k·rate/(2·span)
     first = int(np.ceil(MARGIN * resolved_hz * 2 * span / rate_hz))
@@ -73,7 +92,7 @@ def detect_unresolved_light(
     patterns = _patterns(video, segment.geometry.size)
     # without a window of cosines beyond the band there is nothing that light could stand out of
     if first + WINDOW > count or not patterns or not residual.any():
-        return ()
+        return None
     basis = TemporalBasis(span, count)
     # a lamp may be in several patterns, each with a curve of its own: the energies add up
     energy = sum((_energy(segment, each, residual, basis) for each in patterns), np.zeros(count))
@@ -81,12 +100,7 @@ def detect_unresolved_light(
         percentile_filter(energy, OFTEN, WINDOW, mode="nearest"), np.percentile(energy[first:], OFTEN)
     )
     highest = first + int(np.argmax((energy / usual)[first:]))
-    if not energy[highest] > STANDS_ALONE * usual[highest]:
-        return ()
-    return (
-        f"light changes at about {highest * rate_hz / (2 * span):.5g} Hz, faster than the "
-        f"{resolved_hz:.5g} Hz that this reconstruction resolves: the video shows it as steady or too slow",
-    )
+    return highest * rate_hz / (2 * span) if energy[highest] > STANDS_ALONE * usual[highest] else None
 
 
 def name_gaps(bands_hz: Sequence[tuple[float, float]]) -> tuple[str, ...]:

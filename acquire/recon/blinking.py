@@ -16,6 +16,7 @@ import numpy as np
 
 from acquire.arrays import host
 from acquire.recon.admm import Admm, AdmmParameters
+from acquire.recon.aliasing import unresolved_hz
 from acquire.recon.band import band_operator
 from acquire.recon.bandwidth import (
     FEWEST_COEFFICIENTS,
@@ -53,6 +54,9 @@ BEYOND_S = 2e-6
 """Time per line and frame of the search for light beyond the band, which is skipped if less is left."""
 WIDER_SHARE = 0.5
 """Share of the budget after which nothing is solved again in a wider band."""
+EXPLAINED_BY_NOISE, LEAST_MISSED = 1.25, 0.01
+"""Held-out error relative to the noise above which a lamp may hide that the band mimics, and the error itself
+if the noise is unknown; the search for it takes a tenth of the time."""
 TENTATIVE_SHARE = 0.15
 """Share of the budget after which the search for the bandwidth hurries."""
 LAMPS_SHARE = 0.3
@@ -147,34 +151,80 @@ def refine(
     found = _refine(segment, problem, options, clock, first)
     if not clock.affords(BEYOND_S * segment.geometry.lines * first.basis.frames):
         return found
-    predicted = found.predict()
-    beyond = light_beyond(segment, problem, predicted, options.temporal_merge, first.basis.cosines)
-    if beyond is None:
-        return found
+    seen = light_beyond(segment, problem, found.predict(), options.temporal_merge, first.basis.cosines)
+    if seen is not None:
+        alone = isinstance(found, Refined)
+        first, found = _followed(segment, problem, options, clock, first, found, seen, alone=alone)
+    hidden = _hidden_lamp(segment, problem, options, clock, first, found)
+    if hidden is not None:
+        _, found = _followed(segment, problem, options, clock, first, found, hidden, alone=True)
+    return found
+
+
+def _followed(
+    segment: Segment,
+    problem: Problem,
+    options: SolveOptions,
+    clock: IterationClock,
+    first: InBand,
+    found: Estimate,
+    cosine: int,
+    *,
+    alone: bool,
+) -> tuple[InBand, Estimate]:
+    """A look that holds a cosine beyond the band, ``alone`` or with all that are slower, and its result.
+
+    The ``first`` look and what was ``found`` in it are returned if the other predicts no better.
+    """
     rate_hz = 1e9 / (segment.substep_ns * options.temporal_merge)
     faster = (
-        f"the lines contain light of about {beyond * rate_hz / (2 * first.basis.frames):.3g} Hz, faster "
+        f"the lines contain light of about {cosine * rate_hz / (2 * first.basis.frames):.3g} Hz, faster "
         "than the band of the video"
     )
     if options.bandwidth is not None or clock.spent(WIDER_SHARE):
         clock.shortcuts.append(f"{faster}: a longer budget or a higher bandwidth shows it")
-        return found
+        return first, found
     clock.reset()
-    if isinstance(found, Refined):
-        first = widened(first, beyond, partial(_begin, segment, problem, options))
+    if alone:
+        look = widened(first, cosine, partial(_begin, segment, problem, options))
     else:
         # the constant cosine is a still, of which the wider band is to find the change
-        still, count = first.solver.theta[:1, ...], round(MARGIN * (beyond + 1))
-        first = _glance(segment, problem, options, clock, count=count, still=still)
-    complete_look(first, options, clock)
-    wider = _refine(segment, problem, options, clock, first)
-    before, after = problem.prediction_error(predicted), problem.prediction_error(wider.predict())
+        still, count = first.solver.theta[:1, ...], round(MARGIN * (cosine + 1))
+        look = _glance(segment, problem, options, clock, count=count, still=still)
+    complete_look(look, options, clock)
+    wider = _refine(segment, problem, options, clock, look)
+    before, after = (problem.prediction_error(each.predict()) for each in (found, wider))
     # the noise that many cosines admit hardly shows in the lines, and patterns admit little of it
     if after < (1 if isinstance(wider, Refined) else FREER) * before:
-        return wider
+        return look, wider
     if after < before:
         clock.shortcuts.append(f"{faster}, which a higher bandwidth shows with more noise")
-    return found
+    return first, found
+
+
+def _hidden_lamp(
+    segment: Segment,
+    problem: Problem,
+    options: SolveOptions,
+    clock: IterationClock,
+    first: InBand,
+    found: Estimate,
+) -> int | None:
+    """The cosine of a lamp that the band mimics, if more is left of the lines than their noise."""
+    predicted, noise = found.predict(), problem.noise(segment)
+    left = EXPLAINED_BY_NOISE * noise if noise < np.inf else LEAST_MISSED  # NaN if it is unknown
+    if options.bandwidth is not None or clock.spent(WIDER_SHARE):
+        return None  # nothing would be solved again: the end of the reconstruction tells of it
+    if not problem.prediction_error(predicted) > left:
+        return None
+    cosine_hz = 1 / (2e-9 * segment.substep_ns * options.temporal_merge * first.basis.frames)
+    resolved_hz = first.basis.cosines * cosine_hz
+    found_hz = unresolved_hz(segment, problem, predicted, found.video(), resolved_hz=resolved_hz, clock=clock)
+    if found_hz is None:
+        return None
+    cosine = round(found_hz / cosine_hz)
+    # frames may be too slow for it
+    return cosine if cosine < first.basis.frames // 2 else None
 
 
 def _refine(

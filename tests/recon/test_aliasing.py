@@ -23,8 +23,8 @@ def told(warnings: tuple[str, ...]) -> list[str]:
     return [each for each in warnings if each.startswith("light changes at about")]
 
 
-def test_a_lamp_of_20_khz_is_reported_with_its_frequency() -> None:
-    result = reconstruct(record("fastled", 23, **SIZES).segment, 3, 1)
+def test_a_lamp_of_20_khz_that_a_band_leaves_out_is_reported_with_its_frequency() -> None:
+    result = reconstruct(record("fastled", 23, **SIZES).segment, 3, 1, bandwidth=0.1)
     (words,) = told(result.warnings)
     found_hz = float(words.removeprefix("light changes at about ").split()[0])
     assert found_hz == pytest.approx(20e3, rel=0.01)
@@ -32,8 +32,10 @@ def test_a_lamp_of_20_khz_is_reported_with_its_frequency() -> None:
     assert f"the {result.parameters['resolved_hz']:.5g} Hz that" in words
 
 
-def test_a_lamp_of_20_khz_that_stands_out_of_the_residual_is_shown() -> None:
-    recorded = record("fastled", 22, **SIZES)
+@pytest.mark.parametrize("seed", [22, 23, 24])
+def test_a_lamp_of_20_khz_is_shown(seed: int) -> None:
+    """That of 22 stands out of the residual; the band mimics most of the others."""
+    recorded = record("fastled", seed, **SIZES)
     result = reconstruct(recorded.segment, 3, 1, error=False)
     assert not told(result.warnings)
     assert result.parameters["resolved_hz"] > 20e3
