@@ -64,11 +64,13 @@ def web(
     import logging
     import threading
 
+    from acquire.cli.interrupts import leave_signals_to_the_server
     from acquire.cli.serve import end_with_owner
     from acquire.logs import write_log
     from acquire.web.server import directory_of, serve_page
     from acquire.web.server import link as link_of
 
+    leave_signals_to_the_server()
     where, directory, settings = _settings(config, socket, given, host, port)
     if link:
         say(link_of(settings, where, "viewer" if viewer else "operator"))
