@@ -1,8 +1,8 @@
 """The log of the daemon and its processes: one line per entry, whatever it contains, at a limited rate.
 
 A repeated entry, such as that of a connection that cannot be accepted, is written only a few times a minute;
-once the minute is over, another entry states how many were suppressed. The log can thus neither be forged nor
-fill the disk.
+once the minute is over, another entry states how many were suppressed. Entries about recordings, of which
+each is another fact, are bounded less narrowly. The log can thus neither be forged nor fill the disk.
 """
 
 from __future__ import annotations
@@ -23,6 +23,10 @@ if TYPE_CHECKING:
 
 REPEATS = 10
 """Entries of one kind that are written within `WINDOW_S`."""
+FACTS = 600
+"""The same for entries with `EACH`."""
+EACH = {"most": FACTS}
+"""``extra`` of an entry that repeats none, whatever its form: a change of state, the end of a recovery."""
 WINDOW_S = 60.0
 MOST_KINDS = 256
 """Kinds of entries that are counted at a time."""
@@ -79,11 +83,12 @@ def is_journal(file: int) -> bool:
 @dataclass(slots=True)
 class _Count:
     began_s: float
+    most: int
     seen: int = 0
 
 
 class Bounded(logging.Filter):
-    """Passes `REPEATS` entries of a kind per `WINDOW_S`, and then reports how many it suppressed."""
+    """Passes `REPEATS` (or `FACTS`) entries of a kind per `WINDOW_S`, then reports how many it suppressed."""
 
     def __init__(self, report: Callable[[str], None], now_s: Callable[[], float] = time.monotonic) -> None:
         super().__init__()
@@ -97,12 +102,14 @@ class Bounded(logging.Filter):
             if now_s - count.began_s < WINDOW_S and len(self._counts) < MOST_KINDS:
                 break  # kinds are in the order in which their windows began
             del self._counts[kind]
-            if count.seen > REPEATS:
-                self._report(f"{count.seen - REPEATS} more entries like this one were not written: {kind[2]}")
+            if count.seen > count.most:
+                self._report(
+                    f"{count.seen - count.most} more entries like this one were not written: {kind[2]}"
+                )
         kind = (record.name, record.levelno, str(record.msg)[:MOST_CHARACTERS])
-        count = self._counts.setdefault(kind, _Count(now_s))
+        count = self._counts.setdefault(kind, _Count(now_s, getattr(record, "most", REPEATS)))
         count.seen += 1
-        return count.seen <= REPEATS
+        return count.seen <= count.most
 
 
 def write_log(level: int) -> None:

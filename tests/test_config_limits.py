@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import os
+import subprocess
+import sys
 from collections.abc import Callable
 from pathlib import Path
 
@@ -274,3 +276,22 @@ def test_a_setting_that_is_not_toml_is_shown_corrected(setting: str, said: str, 
         parse_settings([setting])
     assert caught.value.hint.endswith(hint)
     assert bool(caught.value.hint) == bool(hint)
+
+
+@pytest.mark.parametrize("module", ["acquire.config.load_rig", "acquire.sim.media.open_media"])
+def test_a_file_in_a_directory_that_may_not_be_entered_is_not_said_to_be_missing(
+    tmp_path: Path, module: str
+) -> None:
+    (tmp_path / "closed").mkdir()
+    (tmp_path / "closed" / "file.toml").touch()
+    (tmp_path / "closed").chmod(0)
+    module, _, function = module.rpartition(".")
+    code = (
+        f"import os, pathlib; from {module} import {function}; from acquire.errors import UsageError\n"
+        "os.geteuid() or os.seteuid(65534)\n"  # root may enter any directory
+        f"try: {function}(pathlib.Path({str(tmp_path / 'closed' / 'file.toml')!r}))\n"
+        "except UsageError as error: print(error)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert "does not exist" not in done.stdout
+    assert "may not enter" in done.stdout or "Permission denied" in done.stdout

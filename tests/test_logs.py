@@ -7,7 +7,7 @@ import logging
 import subprocess
 import sys
 
-from acquire.logs import MOST_CHARACTERS, REPEATS, WINDOW_S, Bounded, OneLine
+from acquire.logs import EACH, FACTS, MOST_CHARACTERS, REPEATS, WINDOW_S, Bounded, OneLine
 
 
 def record(text: str, *words: object, level: int = logging.INFO) -> logging.LogRecord:
@@ -45,6 +45,16 @@ def test_repeated_entries_are_counted_instead() -> None:
     clock[0] = WINDOW_S
     assert bounded.filter(record("too many files: %d", 1))
     assert told == [f"{1000 - REPEATS} more entries like this one were not written: too many files: %d"]
+
+
+def test_entries_about_recordings_are_no_repetitions() -> None:
+    """The log had the first three takes of a minute, and the others only as a number."""
+    told: list[str] = []
+    bounded = Bounded(told.append, lambda: 0.0)
+    entries = [record("%s → %s (%s)", "armed", "recording", f"take-{i}.zarr") for i in range(FACTS + 1)]
+    for entry in entries:
+        entry.__dict__.update(EACH)
+    assert [bounded.filter(entry) for entry in entries] == [True] * FACTS + [False]
 
 
 def test_the_number_of_kinds_is_bounded() -> None:

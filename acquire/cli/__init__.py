@@ -6,7 +6,8 @@ imported, and heavy libraries are imported inside the commands that need them, s
 at once.
 
 `main` also reports errors of the operating system (a name that is too long, a full disk behind stdout). If
-the reader of a pipe goes away, the command ends without a message.
+the reader of a pipe goes away, the command ends without a message. Standard streams that are closed lead to
+/dev/null.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ from __future__ import annotations
 import errno
 import os
 import sys
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TextIO
 
 from acquire.cli.interrupts import interrupts_handled
 from acquire.cli.output import json_requested, print_error
@@ -39,6 +40,14 @@ def __getattr__(name: str) -> Any:
 
 def main() -> int:
     """Run the command line and return the exit code defined in `acquire.errors`."""
+    _open_closed_streams()
+    code = _carry_out()
+    # Otherwise the interpreter would try to write the rest at exit, fail, and change the exit code.
+    _is_full(sys.stderr)
+    return code
+
+
+def _carry_out() -> int:
     try:
         with interrupts_handled():
             return run(sys.argv[1:])
@@ -48,19 +57,40 @@ def main() -> int:
     except ModuleNotFoundError as error:
         return _failed(not_installed(error))
     except OSError as error:
-        # Without this, the interpreter would try to write the rest to stdout at exit and print a traceback.
-        try:
-            sys.stdout.flush()
-        except OSError:
-            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        full = _is_full(sys.stdout)
         # As other programs end in `acquire ls | head`.
         if error.errno == errno.EPIPE:
             return 1
-        where = f"{error.filename}: " if error.filename else ""
+        where = error.filename or ("standard output" if full else "")
         kind = DeviceError if error.errno in HOST_ERRORS else UsageError
-        return _failed(kind(f"{where}{error.strerror or error}"))
+        return _failed(kind(f"{where}: {error.strerror or error}".removeprefix(": ")))
     except KeyboardInterrupt:
         return EXIT_INTERRUPTED
+
+
+def _open_closed_streams() -> None:
+    """Open /dev/null as each of stdin, stdout and stderr with which this process was not started.
+
+    Python has no stream for them, and the next file to be opened, such as a recording's, would get the
+    descriptor to which every library prints.
+    """
+    for fd, name in enumerate(("stdin", "stdout", "stderr")):
+        if getattr(sys, name) is not None:
+            continue
+        # It gets the lowest free descriptor: this one, unless something has been opened as it already.
+        nowhere = os.open(os.devnull, os.O_RDWR)
+        os.set_inheritable(nowhere, True)  # child processes need the streams, too
+        setattr(sys, name, os.fdopen(nowhere, "w" if fd else "r", encoding="utf-8"))
+
+
+def _is_full(stream: TextIO) -> bool:
+    """Whether a stream does not take what is left to be written; it then leads to /dev/null."""
+    try:
+        stream.flush()
+    except OSError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
+        return True
+    return False
 
 
 def _failed(error: AcquireError) -> int:

@@ -134,8 +134,9 @@ def show(file: FileArgument, json: JsonFlag = False) -> None:
     Example: [bold]acquire config show rig-demo[/]
     """
     from acquire.config import load_rig
+    from acquire.config.service import WHOLE
 
-    table = load_rig(file).model_dump(mode="json")
+    table = load_rig(file).model_dump(mode="json", context=WHOLE)
     if json:
         print_json(table)
         return

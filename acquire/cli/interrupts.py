@@ -1,10 +1,15 @@
-"""Handling of Ctrl-C: the first one is acknowledged and ends the work properly, the second ends it now."""
+"""Handling of Ctrl-C: the first one is acknowledged and ends the work properly, the second ends it now.
+
+So do SIGTERM (of `timeout`, a batch system or a shutdown) and SIGHUP (of a terminal that is closed): a
+command that has armed the instrument with the light off must not leave it like that, nor half a file behind.
+"""
 
 from __future__ import annotations
 
 import math
 import os
 import signal
+import stat
 import sys
 import threading
 import time
@@ -24,6 +29,8 @@ SAME_S = 1.0
 """Interrupts this close together count as one Ctrl-C: when a parent of many threads is killed, the kernel
 sends its death signal once for each thread, and some wrappers forward a signal that the terminal has already
 sent."""
+UNLESS_IGNORED = (signal.SIGTERM, signal.SIGHUP)
+"""Signals that end the work like Ctrl-C, unless whoever started the process ignores them (nohup)."""
 
 
 class _Presses:
@@ -53,13 +60,13 @@ def stop_on_interrupt(finishing: str) -> Iterator[threading.Event]:
     """
     stop_requested = threading.Event()
 
-    def interrupted(_number: int, _frame: object) -> None:
+    def interrupted(number: int, _frame: object) -> None:
         if not _presses.another():
             return
         if stop_requested.is_set():
             _end_now()
         stop_requested.set()
-        note(f"{finishing}; press Ctrl-C again to end now")
+        _acknowledge(number, finishing)
 
     with _handled_by(interrupted):
         yield stop_requested
@@ -70,13 +77,13 @@ def interrupts_handled() -> Iterator[None]:
     """Acknowledge the first Ctrl-C and raise KeyboardInterrupt; a proper end may take some time."""
     stop_requested = threading.Event()
 
-    def interrupted(_number: int, _frame: object) -> None:
+    def interrupted(number: int, _frame: object) -> None:
         if not _presses.another():
             return
         if stop_requested.is_set():
             _end_now()
         stop_requested.set()
-        note("interrupted, ending; press Ctrl-C again to end now")
+        _acknowledge(number, "interrupted, ending")
         raise KeyboardInterrupt
 
     try:
@@ -93,11 +100,38 @@ def _handled_by(handler: signal._HANDLER) -> Iterator[None]:
     if threading.current_thread() is not threading.main_thread():
         yield  # only the main thread can install handlers; other callers stop the work in their own way
         return
-    before = signal.signal(signal.SIGINT, handler)
+    # A script's background job is started with SIGINT ignored; the page stops such jobs by it all the same.
+    numbers = [signal.SIGINT, *(one for one in UNLESS_IGNORED if signal.getsignal(one) != signal.SIG_IGN)]
+    before = {number: signal.signal(number, handler) for number in numbers}
     try:
         yield
     finally:
-        signal.signal(signal.SIGINT, before)
+        for number, earlier in before.items():
+            signal.signal(number, earlier)
+
+
+def leave_signals_to_the_server() -> None:
+    """Let SIGTERM and SIGHUP end this process as usual, until a server installs handlers of its own."""
+    for number in UNLESS_IGNORED:
+        if signal.getsignal(number) != signal.SIG_IGN:
+            signal.signal(number, signal.SIG_DFL)
+
+
+def _acknowledge(number: int, doing: str) -> None:
+    """Say that the work ends, to whoever pressed Ctrl-C; other signals come from programs."""
+    if number == signal.SIGINT:
+        note(f"{doing}; press Ctrl-C again to end now")
+    elif number == signal.SIGHUP:
+        _leave_terminal()
+
+
+def _leave_terminal() -> None:
+    """Write to no terminal any more: its end would be an error in the middle of putting things in order."""
+    nowhere = os.open(os.devnull, os.O_RDWR | os.O_CLOEXEC)
+    for fd in (1, 2):
+        if stat.S_ISCHR(os.fstat(fd).st_mode):
+            os.dup2(nowhere, fd)
+    os.close(nowhere)
 
 
 def _end_now() -> None:

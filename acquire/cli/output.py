@@ -31,8 +31,8 @@ _IN_JSON = re.compile(r"[^ -~\n]")
 
 
 def say(text: str = "", *, err: bool = False) -> None:
-    """Print one line. A closed stderr (as of a web page that was killed) does not end the work."""
-    with contextlib.suppress(*(BrokenPipeError,) if err else ()):
+    """Print one line. A stderr that takes nothing (a closed pipe, a full disk) does not end the work."""
+    with contextlib.suppress(*(OSError,) if err else ()):
         typer.echo(visible(text), err=err)
 
 
@@ -140,7 +140,7 @@ def print_error(error: AcquireError, *, as_json: bool) -> None:
         # `kind`, since the object itself is called error.
         facts = error.to_dict()
         about = {"kind": facts.pop("error"), **facts}
-        typer.echo(json_text({"error": about}), err=True)
+        note_json({"error": about})
         return
     first, *others = error.message.split("\n")
     paragraphs = [f"acquire: error: {first}", *(f"  {line.strip()}" for line in others)]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path, PurePosixPath
 from typing import Annotated
 
@@ -62,7 +61,9 @@ def render(
     from acquire.evaluate.rendering import Look, Panel, check_suffix
     from acquire.evaluate.rendering import render as draw
     from acquire.store import open_video
+    from acquire.store.delivery import whole_file
     from acquire.store.files import check_new_path
+    from acquire.store.refusals import refused
 
     sheet = out.suffix.lower() == ".png"
     count = frames if frames is not None else SHEET_FRAMES if sheet else MOVIE_FRAMES
@@ -79,16 +80,12 @@ def render(
     check_suffix(out)
     check_new_path(out)
     panels = [Panel(PurePosixPath(place).stem, open_video(place)) for place in video]
-    # The suffix stays, since it sets the format.
-    part = out.with_name(f".{os.getpid()}.{out.name}")
-    try:
-        with stage_progress(f"rendering {out.name}") as advance:
-            shown = draw(panels, part, look, count, advance)
-        # Again: a rename would replace what another program has put there in the meantime.
-        check_new_path(out)
-        part.rename(out)
-    finally:
-        part.unlink(missing_ok=True)
+    with (
+        stage_progress(f"rendering {out.name}") as advance,
+        whole_file(out, keep_suffix=True) as part,
+        refused(out, "written"),
+    ):
+        shown = draw(panels, part, look, count, advance)
     size = out.stat().st_size
     if json:
         print_json({"path": str(out), "frames": shown, "bytes": size})

@@ -57,12 +57,14 @@ def serve(
     import logging
     import threading
 
+    from acquire.cli.interrupts import leave_signals_to_the_server
     from acquire.config import find, load_rig, parse_settings
     from acquire.daemon.host import check_host
     from acquire.daemon.server import serve as run_daemon
     from acquire.daemon.uploads import check_upload
     from acquire.logs import write_log
 
+    leave_signals_to_the_server()
     overrides = parse_settings(settings or [])
     if socket is not None:
         overrides["control.socket"] = str(socket.absolute())

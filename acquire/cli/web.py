@@ -64,14 +64,18 @@ def web(
     import logging
     import threading
 
+    from acquire.cli.interrupts import leave_signals_to_the_server
     from acquire.cli.serve import end_with_owner
     from acquire.logs import write_log
     from acquire.web.server import directory_of, serve_page
     from acquire.web.server import link as link_of
 
+    leave_signals_to_the_server()
     where, directory, settings = _settings(config, socket, given, host, port)
     if link:
-        say(link_of(settings, where, "viewer" if viewer else "operator"))
+        asked = any(given is not None for given in (config, host, port))
+        started = None if asked else _of_daemon(where)
+        say(link_of(started or settings, where, "viewer" if viewer else "operator"))
         return
     write_log(logging.INFO)
     logging.getLogger("uvicorn").setLevel(logging.WARNING)
@@ -110,3 +114,20 @@ def _settings(
             raise UsageError(own_words(error.errors()[0]["msg"])) from error
     where = socket or (rig.control.socket if rig else default_socket())
     return where.absolute(), rig.recording.directory.absolute() if rig else None, settings
+
+
+def _of_daemon(socket: Path) -> WebConfig | None:
+    """Return the settings of the page that the daemon has started; None if it has not, or there is none."""
+    import json
+
+    from acquire.client import Client
+    from acquire.config.web import WebConfig
+    from acquire.errors import NoDaemonError
+
+    try:
+        with Client(socket) as daemon:
+            settings = daemon.setup().config["web"]
+    except NoDaemonError:
+        return None
+    # As JSON, for the strict models.
+    return None if settings is None else WebConfig.model_validate_json(json.dumps(settings))

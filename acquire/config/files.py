@@ -62,6 +62,8 @@ def find(name: str | Path, beside: Path | None = None, kind: str = "") -> Path:
     have = ", ".join(builtin_names(kind))
     if name and os.path.isdir(name):  # noqa: PTH112
         why = "is a directory"
+    elif not _may_look_at(name):
+        why = "is in a directory that this user may not enter"
     else:
         why = "is not a regular file" if os.path.lexists(name) else "does not exist"
     what = f"{kind} file" if kind else "configuration file"
@@ -69,6 +71,16 @@ def find(name: str | Path, beside: Path | None = None, kind: str = "") -> Path:
     raise ConfigError(
         f"{what} {shown(str(name))} {why}{near}", possible=f"a path, or one of the built-in {have}"
     )
+
+
+def _may_look_at(name: str | Path) -> bool:
+    try:
+        os.lstat(name)
+    except PermissionError:
+        return False
+    except (OSError, ValueError):  # it is not there, or no file can have this name
+        return True
+    return True
 
 
 def load_rig(

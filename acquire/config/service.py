@@ -6,9 +6,12 @@ import logging
 from typing import Literal
 from urllib.parse import urlsplit
 
-from pydantic import Field, field_validator
+from pydantic import Field, SerializationInfo, field_serializer, field_validator
 
 from acquire.config.base import FrozenModel
+
+WHOLE = {"whole": True}
+"""Context of `RigConfig.model_dump` for a configuration with its secrets, which only its owner may see."""
 
 
 class ServiceConfig(FrozenModel):
@@ -41,7 +44,10 @@ class HooksConfig(FrozenModel):
     command: tuple[str, ...] = Field(
         default=(), description="program and arguments; the event is JSON on its standard input"
     )
-    webhook: str | None = Field(default=None, description="URL to which the event is posted as JSON")
+    webhook: str | None = Field(
+        default=None,
+        description="URL to which the event is posted as JSON; recordings, logs and pages name its host only",
+    )
     timeout_s: float = Field(
         default=10.0, gt=0, le=600, description="time after which command or webhook is abandoned"
     )
@@ -56,3 +62,15 @@ class HooksConfig(FrozenModel):
         if "@" in parts.netloc:
             raise ValueError("credentials would be stored in every recording; use a command to send them")
         return url
+
+    @field_serializer("webhook", when_used="json")
+    def _without_secret(self, url: str | None, info: SerializationInfo) -> str | None:
+        """Leave out all but the host: the path of a chat's webhook is what allows to write there."""
+        return url if url is None or info.context == WHOLE else public_url(url)
+
+
+def public_url(url: str) -> str:
+    """Return a URL for recordings, logs and pages, without what comes after its host."""
+    parts = urlsplit(url)
+    host = f"{parts.scheme}://{parts.netloc}"
+    return url if url.removeprefix(host) in ("", "/") else f"{host}/…"

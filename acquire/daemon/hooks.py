@@ -14,6 +14,7 @@ import sys
 import threading
 from typing import TYPE_CHECKING
 
+from acquire.config.service import public_url
 from acquire.daemon.states import State
 
 if TYPE_CHECKING:
@@ -74,7 +75,7 @@ class Hooks:
                     _call(self._config.command[0], list(self._config.command), text, limit_s)
                 if url := self._config.webhook:
                     words = [sys.executable, "-m", "acquire.daemon.post", f"{limit_s}"]
-                    _call(url, words, b"%s\n%s" % (url.encode(), text), limit_s, posts=True)
+                    _call(public_url(url), words, b"%s\n%s" % (url.encode(), text), limit_s, posts=True)
             if self._ended:
                 return
 

@@ -16,6 +16,7 @@ from __future__ import annotations
 import logging
 from typing import TYPE_CHECKING, Any
 
+from acquire.config.service import WHOLE, public_url
 from acquire.daemon.facts import ChangedKey, Reloaded
 from acquire.daemon.messages import LONGEST_MARK
 from acquire.errors import AcquireError, UsageError
@@ -88,7 +89,16 @@ class Reloading:
 
 def changes(old: RigConfig, new: RigConfig) -> list[ChangedKey]:
     """Return every dotted key whose value differs; for an added or removed table, the table."""
-    return list(_differences("", old.model_dump(mode="json"), new.model_dump(mode="json")))
+    changed = _differences(
+        "", old.model_dump(mode="json", context=WHOLE), new.model_dump(mode="json", context=WHOLE)
+    )
+    return [_public(one) if one.key == "hooks.webhook" else one for one in changed]
+
+
+def _public(one: ChangedKey) -> ChangedKey:
+    """Return the change without the secrets of its URLs, since it is noted in the log and in recordings."""
+    old, new = (url and public_url(url) for url in (one.old, one.new))
+    return ChangedKey(key=one.key, old=old, new=new, holds=one.holds)
 
 
 def _differences(key: str, old: Any, new: Any) -> Iterator[ChangedKey]:

@@ -25,6 +25,7 @@ from acquire.daemon.journal import Journal
 from acquire.daemon.messages import RecoveryStatus
 from acquire.daemon.recoverer import RECOVERED, Found, Task, hindrance, salvage, search
 from acquire.errors import DeviceError
+from acquire.logs import EACH
 from acquire.processes.messages import Failed
 from acquire.processes.worker import Worker
 
@@ -223,7 +224,8 @@ class Salvage:
         if status.state == "recovered" or (status.state == "gone" and not task.committed_lines):
             self.ended(status.path)
         level = logging.INFO if status.state == "recovered" else logging.WARNING
-        log.log(level, "%s %s: %s", status.path, status.state, status.text.removeprefix(RECOVERED))
+        text = status.text.removeprefix(RECOVERED)
+        log.log(level, "%s %s: %s", status.path, status.state, text, extra=EACH)
         return [status]
 
     def _cut_off(self) -> None:

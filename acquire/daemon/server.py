@@ -98,8 +98,13 @@ def serve(config: RigConfig, origin: str = "", reread: Callable[[], RigConfig] |
     return leave(code)
 
 
-def has_terminal() -> bool:
-    """Return whether this process has a controlling terminal, and so SIGHUP means that it was closed."""
+def ends_with_terminal() -> bool:
+    """Return whether SIGHUP means that the terminal of this process was closed, and so ends it.
+
+    It does not without a controlling terminal, nor if it was ignored when this process was started (nohup).
+    """
+    if signal.getsignal(signal.SIGHUP) == signal.SIG_IGN:
+        return False
     try:
         os.close(os.open("/dev/tty", os.O_RDWR | os.O_NOCTTY))
     except OSError:
@@ -124,7 +129,7 @@ class Daemon:
     ) -> None:
         self._service = service
         self._api = Local(service, self._command, reloading)
-        self._hangup_reloads = reloading is not None and not has_terminal()
+        self._hangup_reloads = reloading is not None and not ends_with_terminal()
         self._hung_up: asyncio.Task[None] | None = None
         self._page = page
         self._endpoint = endpoint

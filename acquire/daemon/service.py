@@ -28,6 +28,7 @@ from acquire.daemon.take import Take
 from acquire.daemon.troubles import Troubles
 from acquire.daemon.uploads import Uploads
 from acquire.errors import AcquireError, DeviceError, StateError, UsageError
+from acquire.logs import EACH
 from acquire.store import RunCondition
 from acquire.stream import Begin, CaptureStatus, Note
 
@@ -175,7 +176,7 @@ class Service:
 
     def sign(self, command: str, who: str) -> None:
         """Record who gave a command, in the log and among the events of the current recording."""
-        log.info("%s by %s", command, who)
+        log.info("%s by %s", command, who, extra=EACH)
         if self._run is not None and self._state in (State.RECORDING, State.DRAINING):
             self._run.capture.note("operator", f"{command} by {who}")
 
@@ -457,7 +458,7 @@ class Service:
         before, self._state = self._state, after(self._state, event)
         self._since = datetime.now(UTC)
         level = logging.ERROR if event is Event.FAULT else logging.INFO
-        log.log(level, "%s → %s (%s%s)", before, self._state, event, f": {why}" if why else "")
+        log.log(level, "%s → %s (%s%s)", before, self._state, event, f": {why}" if why else "", extra=EACH)
         path = self._take.path if self._take else self._last.path if self._last else None
         news = f"{event}: {why}" if why else str(event)
         importance = "error" if event is Event.FAULT else "info"

@@ -22,6 +22,7 @@ from acquire.daemon.copier import MOST_WAIT_S, Copy, Reach, Reached, copy_record
 from acquire.daemon.journal import Journal
 from acquire.daemon.messages import UploadStatus
 from acquire.errors import AcquireError, ConfigError, DeviceError, UsageError
+from acquire.logs import EACH
 from acquire.processes.messages import Failed
 from acquire.processes.worker import Worker
 from acquire.store.attributes import upload_target
@@ -107,7 +108,7 @@ class Uploads:
             if self._target is None:
                 log.warning("%s was not uploaded, and will not be: recording.upload_to is not set", path)
             else:
-                log.info("%s was not uploaded: continuing", path)
+                log.info("%s was not uploaded: continuing", path, extra=EACH)
                 self._expect(path)
         self._spawn()
 
@@ -236,7 +237,8 @@ class Uploads:
                 if message.error and known != (message.state, message.error):
                     log.warning("upload of %s %s: %s", message.path, message.state, message.error)
                 elif message.state == "copied":
-                    log.info("upload of %s: %d lines are in %s", message.path, message.lines, message.url)
+                    text = "upload of %s: %d lines are in %s"
+                    log.info(text, message.path, message.lines, message.url, extra=EACH)
                 if message.state in ("copying", "copied"):  # the store can be reached
                     self.warning = None
                 self._list(message)

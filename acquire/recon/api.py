@@ -20,7 +20,7 @@ from acquire.recon.description_check import DescriptionCheck, check_description
 from acquire.recon.error_estimation import RESERVED_ITERATIONS, estimate_error
 from acquire.recon.feasibility import check_budget, least_seconds
 from acquire.recon.judge import frame_error, judge
-from acquire.recon.options import SolveOptions, Stop
+from acquire.recon.options import SolveOptions, Stop, check_hooks, check_table
 from acquire.recon.problem import build_problem
 from acquire.recon.result import Look, Progress, Quality, Reconstruction
 from acquire.recon.solve import KnownImage
@@ -113,6 +113,8 @@ def reconstruct(
             possible="a segment of a recording",
             hint="recording.cut(first_line=..., lines=...)",
         )
+    check_hooks(stop, progress=progress, look=look)
+    check_table("solver_options", solver_options)
     chosen = open_solver(solver, solver_options)
     count = preset_iterations(solver, preset)
     if iterations is not None:

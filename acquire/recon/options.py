@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from numbers import Real
 from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
@@ -10,8 +11,11 @@ import numpy as np
 from acquire.errors import UsageError
 from acquire.geometry import is_integer
 from acquire.plugins import SOLVERS
+from acquire.text import shown
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
     from numpy.typing import NDArray
 
     from acquire.recon.denoisers import Denoiser
@@ -44,6 +48,13 @@ class SolveOptions:
     choice: Choice | None = None
 
     def __post_init__(self) -> None:
+        for name, number in (
+            ("bandwidth", self.bandwidth),
+            ("tv_weight", self.tv_weight),
+            ("budget_s", self.budget_s),
+        ):
+            if number is not None and (isinstance(number, bool) or not isinstance(number, Real)):
+                raise UsageError(f"{name} = {shown(number)} is not a number", possible="a number, or None")
         if self.bandwidth is not None and not 0 < self.bandwidth <= 1:
             raise UsageError(
                 f"bandwidth {self.bandwidth} is out of range",
@@ -71,6 +82,15 @@ class SolveOptions:
                     f"solver {self.solver!r} takes no {option}", possible=f"solver {', '.join(able)}"
                 )
 
+        # imported here: it needs these options
+        from acquire.recon.reuse import Choice
+
+        if self.choice is not None and not isinstance(self.choice, Choice):
+            raise UsageError(
+                f"choice = {shown(self.choice)} is no choice of another video",
+                possible="acquire.recon.reuse.Choice, or None",
+            )
+
     def check_shapes(self, size: int, video_shape: tuple[int, int, int]) -> None:
         """Raise UsageError unless the given arrays are finite and fit the segment."""
         _check_array("initial video", self.initial, video_shape)
@@ -80,6 +100,23 @@ class SolveOptions:
             raise UsageError(
                 "the static image is dark everywhere", possible="an image of the lit scene at rest"
             )
+
+
+def check_hooks(stop: object, **functions: object) -> None:
+    """Raise UsageError unless ``stop`` can be asked and the functions called. None is possible for each."""
+    for name, function in functions.items():
+        if function is not None and not callable(function):
+            raise UsageError(f"{name} = {shown(function)} cannot be called", possible="a function, or None")
+    if stop is not None and not callable(getattr(stop, "is_set", None)):
+        raise UsageError(f"stop = {shown(stop)} cannot be asked", possible="a threading.Event, or None")
+
+
+def check_table(name: str, table: Mapping[str, Any] | None) -> None:
+    """Raise UsageError unless options are given by name, or not at all."""
+    if table is not None and not (hasattr(table, "keys") and all(isinstance(key, str) for key in table)):
+        raise UsageError(
+            f"{name} = {shown(table)} are no named options", possible="a dictionary by name, or None"
+        )
 
 
 def _check_array(what: str, given: NDArray[Any] | None, shape: tuple[int, ...]) -> None:

@@ -224,8 +224,9 @@ def _begin_worker(shared: _Shared, threads: int) -> None:
     global _worker  # noqa: PLW0603  # the only place for the state that a worker process gets at its start
     import numba
 
-    # a terminal sends Ctrl-C to all of its processes; the parent asks this one to stop
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    # a terminal sends Ctrl-C, and its end, to all of its processes; the parent asks this one to stop
+    for number in (signal.SIGINT, signal.SIGHUP):
+        signal.signal(number, signal.SIG_IGN)
     # numba refuses more threads than it was started with
     numba.set_num_threads(min(threads, numba.get_num_threads()))
     limit_blas(threads)

@@ -127,7 +127,11 @@ class VideoScene:
 
 def open_media(path: Path) -> Source:
     """Return the frames of a file, read by the first library that can."""
-    if not path.is_file():
+    try:
+        there = path.is_file()
+    except PermissionError as error:
+        raise UsageError(f"scene file {path} cannot be looked at: {error.strerror}") from error
+    if not there:
         raise UsageError(f"scene file {path} does not exist")
     if path.suffix == ".npy":
         return _ArrayFile(path)

@@ -47,13 +47,17 @@ class Delivery(Protocol):
 
 
 @contextmanager
-def whole_file(path: Path) -> Iterator[Path]:
+def whole_file(path: Path, *, keep_suffix: bool = False) -> Iterator[Path]:
     """Yield an empty file to be filled, which appears at ``path`` when the block ends without an error.
+
+    With ``keep_suffix`` it has the suffix of ``path``, which tells some libraries the format.
 
     Raises UsageError if ``path`` was created in the meantime, which is left alone, and the errors of
     `refused` if the disk refuses; then nothing is left behind.
     """
     part = _partial(path)
+    if keep_suffix:
+        part = part.with_name(part.name + path.suffix)
     with refused(path, "written"):
         part.open("xb").close()
     try:

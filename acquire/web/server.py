@@ -95,7 +95,16 @@ def address_of(config: WebConfig, listener: sockets.socket | None = None) -> str
 
 
 def link(config: WebConfig, socket: Path, role: str) -> str:
-    """Return the URL with a token, in the fragment after #, which browsers do not send to servers."""
+    """Return the URL with a token, in the fragment after #, which browsers do not send to servers.
+
+    Raises UsageError for a page on any free port, which only its process knows.
+    """
+    if not config.port:
+        raise UsageError(
+            "the page listens on any free port (web.port = 0), which only its log names",
+            hint="web.port with a number, or the token from the file "
+            f"{config.token_path(socket)} after the address in the log and '#token='",
+        )
     tokens = load_tokens(config.token_path(socket))
     return f"{address_of(config)}#token={tokens.operator if role == 'operator' else tokens.viewer}"
 

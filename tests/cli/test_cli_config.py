@@ -138,6 +138,12 @@ def test_show_prints_an_equivalent_file(cli: Cli, rig_file: Path, tmp_path: Path
     assert RigConfig.model_validate(cli("config", "show", rig_file, "--json").json) == load_rig(rig_file)
 
 
+def test_show_keeps_the_whole_address_of_a_webhook(cli: Cli, rig_file: Path) -> None:
+    with rig_file.open("a") as file:
+        file.write("\n[hooks]\nwebhook = 'https://chat.example/T0/s3cret'\n")
+    assert 'hooks.webhook = "https://chat.example/T0/s3cret"' in cli("config", "show", rig_file).out
+
+
 def test_schema_describes_every_key(cli: Cli) -> None:
     schema = cli("config", "schema").json
     assert set(RigConfig.model_fields) == set(schema["properties"])

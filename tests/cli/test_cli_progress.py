@@ -164,3 +164,34 @@ def test_interrupts_close_together_are_one_ctrl_c(monkeypatch: pytest.MonkeyPatc
             signal.raise_signal(signal.SIGINT)
         signal.raise_signal(signal.SIGINT)  # the echo may come after the work has ended in good order
     assert asked.is_set()
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
+def test_a_program_s_order_to_end_is_like_ctrl_c(number: signal.Signals) -> None:
+    """`timeout`, a batch system, a terminal that is closed: what was begun is put in order."""
+    code = f"""
+import signal, time
+from acquire.cli import interrupts
+def end_by():
+    try:
+        with interrupts.interrupts_handled():
+            signal.raise_signal({int(number)})
+            time.sleep({LIMIT_S})
+    except KeyboardInterrupt:
+        return "in order"
+print(end_by(), flush=True)
+"""
+    ended = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=False
+    )
+    assert (ended.returncode, ended.stdout, ended.stderr) == (0, "in order\n", "")
+
+
+def test_a_hangup_that_nohup_ignores_stays_ignored() -> None:
+    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    try:
+        with interrupts_handled():
+            signal.raise_signal(signal.SIGHUP)
+        assert signal.getsignal(signal.SIGHUP) == signal.SIG_IGN
+    finally:
+        signal.signal(signal.SIGHUP, before)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import subprocess
 import sys
 import time
@@ -20,7 +21,7 @@ from acquire.config.scene import ConstantDrive, SineDrive
 from acquire.reconstruct import Options
 from acquire.sim.leds import LedConfig, LedSceneConfig
 from acquire.simulate import simulate
-from acquire.store import open_recording, open_video
+from acquire.store import open_recording, open_video, write_video
 
 Cli = Callable[..., Any]
 
@@ -392,3 +393,18 @@ def test_a_cluster_gives_the_same_result_as_this_machine(
         assert ended.returncode == 0, ended.stderr
     here, there = (open_video(tmp_path / f"{name}.zarr").video[:] for name in ("here", "there"))
     np.testing.assert_allclose(here, there, atol=1e-2)  # sums in another order
+
+
+@pytest.mark.parametrize("suffix", [".png", ".gif", ".webp", ".mp4", ".html"])
+def test_a_disk_that_takes_no_more_ends_a_rendering_in_words(tmp_path: Path, suffix: str) -> None:
+    frames = np.random.default_rng(8).random((8, 64, 64)).astype(np.float32)
+    write_video(tmp_path / "v.zarr", frames, np.arange(8, dtype=np.int64), 2.5, 1, {})
+    limited = "import resource; resource.setrlimit(resource.RLIMIT_FSIZE, (3000, -1));"
+    program = [sys.executable, "-c", f"{limited} from acquire.cli import main; raise SystemExit(main())"]
+    out = tmp_path / f"v{suffix}"
+    words = ["render", str(tmp_path / "v.zarr"), "--out", str(out)]
+    done = subprocess.run(
+        [*program, *words], capture_output=True, text=True, check=False, env=os.environ | {"COLUMNS": "400"}
+    )
+    assert (done.returncode, f"{out} cannot be written: " in done.stderr) == (5, True), done.stderr
+    assert [path.name for path in tmp_path.iterdir()] == ["v.zarr"]

@@ -201,4 +201,57 @@ def test_a_full_disk_behind_stdout_ends_in_words() -> None:
             check=False,
         )
     assert ended.returncode == 5
-    assert ended.stderr == "acquire: error: No space left on device\n"
+    assert ended.stderr == "acquire: error: standard output: No space left on device\n"
+
+
+@pytest.mark.parametrize(
+    ("words", "closed", "code"),
+    [
+        (("plugins",), ">&-", 0),
+        (("plugins",), "<&- >&- 2>&-", 0),
+        (("serve", "--config", "nowhere"), "2>&-", 2),
+        (("serve", "--config", "nowhere"), "2>/dev/full", 2),
+        (("calibrate", "all", "--out", "{home}/cal.zarr", "--socket", "{home}/no.sock"), "<&-", 3),
+    ],
+)
+def test_closed_and_full_streams_change_nothing_else(
+    tmp_path: Path, words: tuple[str, ...], closed: str, code: int
+) -> None:
+    """As under cron, or after `exec >&-`."""
+    command = " ".join([sys.executable, "-m", "acquire", *words]).format(home=tmp_path)
+    ended = subprocess.run(
+        ["/bin/sh", "-c", f"{command} {closed}"],
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=False,
+        cwd=tmp_path,
+    )
+    assert ended.returncode == code, ended.stderr
+    assert "Traceback" not in ended.stderr
+
+
+def test_no_file_gets_the_descriptor_of_a_closed_stream(tmp_path: Path) -> None:
+    code = (
+        "import os, sys; sys.argv = ['acquire', '--version']; from acquire.cli import main; main();"
+        "number = os.open('new', os.O_CREAT | os.O_WRONLY); os.write(2, b'a library'); sys.exit(number)"
+    )
+    ended = subprocess.run(
+        ["/bin/sh", "-c", f'{sys.executable} -c "{code}" 2>&-'], timeout=60, check=False, cwd=tmp_path
+    )
+    assert ended.returncode > 2
+    assert (tmp_path / "new").read_bytes() == b""
+
+
+def test_progress_and_notes_that_cannot_be_written_end_no_work() -> None:
+    code = "from acquire.cli.output import note; note('one'); note('two'); print('done')"
+    with Path("/dev/full").open("w") as full:
+        ended = subprocess.run(
+            [sys.executable, "-c", code],
+            stdout=subprocess.PIPE,
+            stderr=full,
+            text=True,
+            timeout=60,
+            check=False,
+        )
+    assert ended.stdout == "done\n"

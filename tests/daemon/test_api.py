@@ -6,6 +6,7 @@ import asyncio
 import contextlib
 import inspect
 import json
+import logging
 import socket
 import threading
 import time
@@ -27,6 +28,7 @@ from acquire.daemon.local import Local
 from acquire.daemon.messages import CapacityStatus, error_body
 from acquire.daemon.service import Service
 from acquire.errors import AcquireError, NoDaemonError, StateError, UsageError
+from acquire.logs import Bounded
 
 EVENTS = b"HTTP/1.1 200 OK\r\nContent-Type: text/event-stream\r\nConnection: close\r\n\r\n"
 
@@ -357,3 +359,16 @@ def until(met: object, limit_s: float = 300.0) -> None:
     while not met():  # type: ignore[operator]
         assert time.monotonic() < deadline
         time.sleep(0.01)
+
+
+def test_the_log_has_every_change_of_state_of_a_minute(
+    daemon: Client, caplog: pytest.LogCaptureFixture
+) -> None:
+    """It had the first three recordings, and of the others their number."""
+    caplog.set_level(logging.INFO)
+    for _ in range(12):
+        daemon.arm()
+        daemon.disarm()
+    bounded = Bounded(lambda _: None)
+    written = [entry.getMessage() for entry in caplog.records if bounded.filter(entry)]
+    assert sum("→" in one for one in written) == 24, written

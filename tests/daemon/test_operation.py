@@ -18,6 +18,7 @@ from pathlib import Path
 import psutil
 import pytest
 from fake_run import FakeRun, rig_config
+from waiting import until
 
 from acquire.cli.install_service import install_service
 from acquire.config import builtin_directory, load_rig
@@ -28,7 +29,9 @@ from acquire.daemon.host import memory_bytes, needed_bytes
 from acquire.daemon.messages import ArmRequest
 from acquire.daemon.metrics import metrics_text
 from acquire.daemon.news import NewsLog
+from acquire.daemon.reload import changes, words
 from acquire.daemon.service import Service
+from acquire.daemon.setup import setup_of
 from acquire.daemon.states import State
 from acquire.daemon.unit import WATCHDOG_S, unit_text
 from acquire.errors import ConfigError, UsageError
@@ -151,6 +154,23 @@ def test_a_server_that_answers_byte_by_byte_is_given_up(caplog: pytest.LogCaptur
 def test_webhooks_that_cannot_be_are_refused(url: str) -> None:
     with pytest.raises(ConfigError, match=r"hooks\.webhook"):
         load_rig("rig-demo", {"hooks.webhook": url})
+
+
+def test_the_secret_in_a_webhook_s_path_stays_in_the_rig_file(caplog: pytest.LogCaptureFixture) -> None:
+    """Whoever knows the path of a chat's webhook may write there; recordings are passed on."""
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        url = f"http://127.0.0.1:{server.getsockname()[1]}"
+    old, new = (load_rig("rig-demo", {"hooks.webhook": f"{url}/T0/{one}"}) for one in ("s3cret", "0ther"))
+    assert old.model_dump(mode="json")["hooks"]["webhook"] == f"{url}/…"  # in recordings
+    assert "s3cret" not in setup_of(old, "rig.toml").model_dump_json()
+    (change,) = changes(old, new)  # it is noticed all the same
+    assert words(change) == f"hooks.webhook = '{url}/…', it was '{url}/…'"
+    log = NewsLog()
+    hooks = Hooks(old.hooks, log, "rig")
+    log.add("loss", "x", level="error")
+    until(lambda: f"hook {url}/…: " in caplog.text)
+    hooks.close()
+    assert "s3cret" not in caplog.text
 
 
 def unit_of(tmp_path: Path, *, user: bool) -> configparser.SectionProxy:

@@ -187,6 +187,15 @@ def test_what_cannot_be_is_refused_with_what_can() -> None:
         (UsageError, "budget of -1", {"budget_s": -1.0}),
         (UsageError, "0 iterations", {"iterations": 0}),
         (UsageError, "2.5 iterations", {"iterations": 2.5}),
+        (UsageError, "bandwidth = '1' is not a number", {"bandwidth": "1"}),
+        (UsageError, "tv_weight = True is not a number", {"tv_weight": True}),
+        (UsageError, r"budget_s = \[5\] is not a number", {"budget_s": [5]}),
+        (UsageError, "solver_options = 5 are no named options", {"solver_options": 5}),
+        (UsageError, "solver_options = {1: 2} are no named options", {"solver_options": {1: 2}}),
+        (UsageError, "progress = True cannot be called", {"progress": True}),
+        (UsageError, "look = 'x' cannot be called", {"look": "x"}),
+        (UsageError, "stop = True cannot be asked", {"stop": True}),
+        (UsageError, "choice = 'tv' is no choice", {"choice": "tv"}),
     ):
         with pytest.raises(error, match=match):
             reconstruct(good, 3, 1, **call)

@@ -3,12 +3,17 @@
 from __future__ import annotations
 
 import contextlib
+import os
+import pty
 import re
+import signal
+import subprocess
 from pathlib import Path
 
 import numpy as np
 import pytest
-from live_daemon import Daemon
+from live_daemon import COMMAND, Daemon
+from waiting import until
 
 from acquire.calibrate import open_calibration
 
@@ -118,3 +123,28 @@ def test_an_unsuitable_rig_is_refused_before_anything_is_recorded(
         assert why in refused.err
         assert "leave psf out" in refused.err
         assert not list((tmp_path / "calibration-recordings").iterdir())
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
+def test_a_step_that_is_ended_leaves_the_light_s_code_on(tmp_path: Path, number: signal.Signals) -> None:
+    """A closed terminal left the instrument armed with the light off: the next recording was dark."""
+    with contextlib.closing(Daemon(tmp_path)) as daemon, daemon.client() as client:
+        words = ("calibrate", "all", "--yes", "--only", "dark", "--lines", 1_000_000, "--out", "cal.zarr")
+        parent, child = pty.openpty()
+        with subprocess.Popen(
+            [*COMMAND, *map(str, words)],
+            stdin=child,
+            stdout=child,
+            stderr=child,
+            cwd=tmp_path,
+            env=os.environ | {"ACQUIRE_SOCKET": str(daemon.socket)},
+        ) as step:
+            os.close(child)
+            until(lambda: client.status().state == "recording")
+            if number is signal.SIGHUP:
+                os.close(parent)  # from now on every word to the terminal is an error
+            step.send_signal(number)
+            assert step.wait(120) == 130
+        if number is not signal.SIGHUP:
+            os.close(parent)
+        assert client.status().state == "idle"

@@ -166,23 +166,33 @@ def test_sighup_reloads_the_page_and_the_log_level(daemon: Daemon) -> None:
     assert daemon.end() == 0
 
 
-def test_a_terminal_that_is_closed_ends_its_daemon(tmp_path: Path) -> None:
-    """Nobody would see its messages; without a terminal, the same signal reloads the file."""
+@pytest.mark.parametrize("nohup", [False, True])
+def test_a_terminal_that_is_closed_ends_its_daemon(tmp_path: Path, nohup: bool) -> None:
+    """Nobody would see its messages; without a terminal, or with nohup, the same signal reloads the file."""
     terminal, end = os.openpty()
     log = tmp_path / "serve.log"
+
+    def begin() -> None:
+        fcntl.ioctl(0, termios.TIOCSCTTY, 0)
+        if nohup:
+            signal.signal(signal.SIGHUP, signal.SIG_IGN)
+
     with log.open("wb") as written:
         process = subprocess.Popen(
             [*COMMAND, "serve", "--config", str(write_rig(tmp_path))],
             stdin=end,
             stderr=written,
             start_new_session=True,
-            preexec_fn=lambda: fcntl.ioctl(0, termios.TIOCSCTTY, 0),  # noqa: PLW1509 - one system call
+            preexec_fn=begin,  # noqa: PLW1509 - two system calls
         )
     os.close(end)
     try:
         until(lambda: "listening on" in log.read_text())
         os.close(terminal)
+        if nohup:
+            until(lambda: "reload by SIGHUP: the file has not changed" in log.read_text(), limit_s=60)
+            process.terminate()
         assert process.wait(60) == 0
     finally:
         process.kill()
-    assert "SIGHUP: ending" in log.read_text()
+    assert f"{'SIGTERM' if nohup else 'SIGHUP'}: ending" in log.read_text()

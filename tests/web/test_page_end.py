@@ -8,6 +8,7 @@ from pathlib import Path
 from urllib.parse import urlsplit
 
 import pytest
+from live_daemon import Daemon
 from page_server import PageServer
 
 
@@ -32,3 +33,18 @@ def test_pending_requests_do_not_fail_when_the_page_ends(tmp_path: Path, reads: 
     log = server.log.read_text()
     assert "Traceback" not in log, log
     assert "timeout graceful shutdown" not in log
+
+
+def test_the_link_leads_to_the_page_that_the_daemon_has_started(tmp_path: Path) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as free:
+        port = free.getsockname()[1]
+    with contextlib.closing(Daemon(tmp_path, f"web.port={port}")) as daemon:
+        assert daemon("web", "--link").out.startswith(f"http://127.0.0.1:{port}/#token=")
+        elsewhere = daemon("web", "--link", "--port", port + 1)
+        assert elsewhere.out.startswith(f"http://127.0.0.1:{port + 1}/#token=")
+        assert daemon("web", "--link", "--config", "rig-demo").out.startswith("http://127.0.0.1:8300/#token=")
+        unknown = daemon("web", "--link", "--port", 0)
+        assert unknown.code == 2
+        assert "the page listens on any free port (web.port = 0)" in unknown.err
+    # without a daemon, as before
+    assert daemon("web", "--link").out.startswith("http://127.0.0.1:8300/#token=")
