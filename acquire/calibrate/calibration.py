@@ -350,7 +350,8 @@ def _step(attrs: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _alignment(attrs: Mapping[str, Any]) -> AlignmentFound:
-    numbers = {key: float(attrs[key]) for key in Alignment().facts()}
+    # calibrations from before the distortion was measured have none
+    numbers = {key: float(attrs[key]) for key in Alignment().facts() if key in attrs or key != "distortion"}
     return AlignmentFound(Alignment(**numbers), {k: float(v) for k, v in attrs["uncertainty"].items()})
 
 

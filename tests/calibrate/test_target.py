@@ -10,12 +10,14 @@ import numpy as np
 import pytest
 from instruments import COLUMNS, NOISE, N, S, columns_truth, dots, record, white
 
+from acquire.alignment import Alignment
 from acquire.calibrate import Calibration, Measured, calibrated
 from acquire.calibrate.columns import dark, flat
 from acquire.calibrate.exposure import instrument_of, open_exposure
 from acquire.calibrate.orientation import MODEL, VIEWS, View, oriented
 from acquire.calibrate.still import stills
 from acquire.calibrate.target import alignment, orientation
+from acquire.calibrate.words import found_facts
 from acquire.errors import UsageError
 from acquire.forward import DualArm
 from acquire.sim.scenes import build_scene
@@ -111,6 +113,37 @@ def test_shift_and_turn_to_some_hundredths(tmp_path: Path, off: dict[str, float]
     for name in ("rows", "columns"):
         error = abs(found.alignment.facts()[name] - off[name])
         assert error < 8 * found.uncertainty[name]
+
+
+@pytest.mark.parametrize("part", [0.03, -0.02])
+def test_a_lens_that_distorts_arm_b_is_measured(tmp_path: Path, part: float) -> None:
+    """Without it, the similarity that fits best leaves most of the arms' difference."""
+    off = {"rows": 1.5, "columns": -1.0, "turn_deg": 0.4, "beyond": "edge"}
+    lens = {"kind": "lens_distortion", "arm": "b", "part": part}
+    scene = dots(tmp_path, [*NOISE, {"kind": "misregistration", **off}, lens])
+    path = record(tmp_path / "target.zarr", scene, "target", 768)
+    found = alignment(open_exposure(path), empty(path))
+    assert found.alignment is not None
+    at = found.alignment.alignment
+    assert at.distortion == pytest.approx(part, abs=0.004)  # 0.14 fine pixels
+    assert at.magnification == pytest.approx(1, abs=2e-3)
+    assert at.rows == pytest.approx(1.5, abs=0.08)
+    assert "outwards" in found_facts(found)["distorted"]
+    picture = build_scene(scene, N, 1e-5).frames(0, 1)
+    segment = replace(open_recording(path).cut(0, 256), alignment=at)
+
+    def difference(arrangement: Alignment) -> float:
+        operator = DualArm(segment.geometry, segment.code, 1, segment.geometry.span, alignment=arrangement)
+        return float((segment.samples()[1] - operator.forward(picture)[1]).std())
+
+    assert difference(at) < 0.7 * difference(replace(at, distortion=0.0, magnification=1 + at.distortion / 2))
+
+
+def test_coinciding_lenses_have_no_distortion(recordings: dict[str, Path], known: Calibration) -> None:
+    found = alignment(open_exposure(recordings["target"]), known)
+    assert found.alignment is not None
+    assert found.alignment.alignment.distortion == 0
+    assert "distorted" not in found_facts(found)
 
 
 def test_a_flat_that_ends_at_the_fields_edge_is_corrected(
