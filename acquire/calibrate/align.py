@@ -17,6 +17,7 @@ from scipy.ndimage import gaussian_filter, map_coordinates, spline_filter
 from scipy.optimize import least_squares
 
 from acquire.alignment import LARGEST_DISTORTION, Alignment
+from acquire.blur import falling
 from acquire.calibrate.calibration import AlignmentFound
 from acquire.errors import UsageError
 
@@ -35,6 +36,8 @@ BRIGHTNESS = (4, 5)
 """Places among the fitted numbers of the factor and the offset of arm B's brightness."""
 DISTORTED_PIXELS, DISTORTED_SURE = 0.05, 5.0
 """Least distortion that counts, in fine pixels at the middle of a side and in standard uncertainties."""
+LEAST_FALL, FALL_SURE = 0.015, 8.0
+"""Least fall of the light from the centre to a side that counts, as a part and in standard uncertainties."""
 POINT_ROUNDS = 5
 """Rounds to a point's position in both images, each of which reduces its error by twice the distortion."""
 WORST_PIXELS = 0.2
@@ -42,6 +45,32 @@ WORST_PIXELS = 0.2
 is useless, as from a target without texture."""
 LEAST_CORRELATION = 0.5
 """Of the two images where they meet. Without texture, noise alone may seem to determine an alignment."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FallOff:
+    """What a lens takes of the light on A's rows and B's columns: r₁, r₂, c₁, c₂, and their uncertainties.
+
+    ``brightness`` is the light of arm B over that of arm A in the centre.
+    """
+
+    terms: NDArray[np.float64]
+    errors: NDArray[np.float64]
+    brightness: float
+
+    @property
+    def clear(self) -> bool:
+        """Whether there is any."""
+        return bool(self._clear.any())
+
+    @property
+    def in_b(self) -> bool:
+        """Whether there is any along the transfer of arm B, where a field's end does not look like it."""
+        return bool(self._clear[2:].any())
+
+    @property
+    def _clear(self) -> NDArray[np.bool_]:
+        return np.asarray(np.abs(self.terms) > np.maximum(LEAST_FALL, FALL_SURE * self.errors))
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,6 +84,7 @@ class Match:
     found: AlignmentFound
     misfit: float
     brightness: float
+    fall_off: FallOff
 
 
 def align(a: Still, b: Still, geometry: Geometry, start: tuple[float, float] = (0.0, 0.0)) -> Match:
@@ -77,7 +107,9 @@ def align(a: Still, b: Still, geometry: Geometry, start: tuple[float, float] = (
     errors = np.delete(fit.errors, BRIGHTNESS).tolist()
     uncertainty = dict(zip(NUMBERS, errors, strict=False))
     found = AlignmentFound(fit.alignment, uncertainty)
-    return Match(found, comparison.misfit(numbers), comparison.brightness(numbers))
+    return Match(
+        found, comparison.misfit(numbers), comparison.brightness(numbers), comparison.fall_off(numbers)
+    )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -186,7 +218,7 @@ class _Comparison:
         self._level = float(a.std())
 
     def __call__(self, numbers: NDArray[np.float64]) -> NDArray[np.float64]:
-        a, b, inside = self._pairs(numbers)
+        a, b, inside, _ = self._pairs(numbers)
         # 0 outside, because `least_squares` needs the same number of residuals in every call
         residual = np.where(inside, b - numbers[4] * a - numbers[5], 0.0)[self._good]
         weighted: NDArray[np.float64] = residual * self._images.weight
@@ -194,7 +226,7 @@ class _Comparison:
 
     def misfit(self, numbers: NDArray[np.float64]) -> float:
         """Return the RMS of the differences, relative to the images' variation."""
-        a, b, inside = self._pairs(numbers)
+        a, b, inside, _ = self._pairs(numbers)
         residual = (b - numbers[4] * a - numbers[5])[self._good & inside]
         if not residual.size:
             return float("inf")
@@ -202,7 +234,7 @@ class _Comparison:
 
     def correlation(self, numbers: NDArray[np.float64]) -> float:
         """Return the correlation coefficient of the images; 0 where either is uniform."""
-        a, b, inside = self._pairs(numbers)
+        a, b, inside, _ = self._pairs(numbers)
         a, b = (image[self._good & inside] for image in (a, b))
         if a.size < 2 or not (a.std() > 0 and b.std() > 0):
             return 0.0
@@ -210,13 +242,45 @@ class _Comparison:
 
     def brightness(self, numbers: NDArray[np.float64]) -> float:
         """Return B's light over A's; not the fitted factor, which blur and noise of each image lower."""
-        a, b, inside = self._pairs(numbers)
+        a, b, inside, _ = self._pairs(numbers)
         common = self._good & inside
         total = float(a[common].sum())
         return float(b[common].sum()) / total if total > 0 else 1.0
 
-    def _pairs(self, numbers: NDArray[np.float64]) -> tuple[NDArray[Any], NDArray[Any], NDArray[np.bool_]]:
-        """Return A and B where they show the same point, and whether both cover it."""
+    def fall_off(self, numbers: NDArray[np.float64]) -> FallOff:
+        """Fit B = A·(1 + c₁·x + c₂·x²)/(1 + r₁·y + r₂·y²), with A's row y and B's column x from −1 to 1."""
+        a, b, inside, (y, x) = self._pairs(numbers)
+        common = self._good & inside
+        a, b, y, x = (each[common] for each in (a, b, y, x))
+
+        def light(terms: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+            r1, r2, c1, c2 = terms[:4]
+            return falling((r1, r2), y), falling((c1, c2), x)
+
+        def residual(terms: NDArray[np.float64]) -> NDArray[np.float64]:
+            rows, columns = light(terms)
+            return np.asarray((b - terms[4] * a * columns / rows - terms[5]) * self._images.weight)
+
+        start = np.array([0, 0, 0, 0, numbers[4], numbers[5]])
+        spread = float(np.median(np.abs(residual(start)))) / 0.6745
+        # within the bounds both are above 0
+        most = np.array([0.4, 0.5, 0.4, 0.5, np.inf, np.inf])
+        solved = least_squares(
+            residual, start, bounds=(-most, most), loss="soft_l1", f_scale=max(1.0, spread), x_scale="jac"
+        )
+        jacobian = np.asarray(solved.jac, np.float64)
+        freedom = max(1, len(a) - len(start))
+        errors = np.sqrt(np.diag(np.linalg.pinv(jacobian.T @ jacobian)) * 2 * solved.cost / freedom)
+        rows, columns = light(solved.x)
+        return FallOff(solved.x[:4], errors[:4], float((b / columns).sum() / (a / rows).sum()))
+
+    def _pairs(
+        self, numbers: NDArray[np.float64]
+    ) -> tuple[NDArray[Any], NDArray[Any], NDArray[np.bool_], tuple[NDArray[Any], NDArray[Any]]]:
+        """Return A and B where they show the same point, whether both cover it, and A's row and B's column.
+
+        The last two are from −1 to 1 over the field.
+        """
         # Row y of B and column x of A show one point if (y, q)·f = m·Q·(p, x) + shift, all from the middle:
         # two equations, linear in p, the row of A, and q, the column of B. Without distortion f is 1.
         alignment = _alignment(numbers, self.geometry)
@@ -241,4 +305,4 @@ class _Comparison:
         b = map_coordinates(self._b, [rows_b, columns_b], order=3, mode="nearest", prefilter=False)
         low, high = EDGE, self._n - 1 - EDGE
         inside = (at_a_row > low) & (at_a_row < high) & (at_b_column > low) & (at_b_column < high)
-        return a, b, inside
+        return a, b, inside, (p / (self._n / 2), q / (self._n / 2))
