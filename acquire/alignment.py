@@ -1,4 +1,7 @@
-"""Position of arm B's image relative to arm A's: a similarity of the plane, in fine pixels of the scene."""
+"""Position of arm B's image relative to arm A's: a similarity of the plane and a radial distortion.
+
+Positions are in fine pixels of the scene, from the centre of the field.
+"""
 
 from __future__ import annotations
 
@@ -16,6 +19,10 @@ if TYPE_CHECKING:
 LARGEST_SHIFT_PIXELS = 1e4
 LARGEST_TURN_DEG = 45.0
 LARGEST_MAGNIFICATION = 2.0
+LARGEST_DISTORTION = 0.06
+"""With 0.07, the field's corners are at the largest distance from the axis that can be imaged."""
+ROUNDS = 12
+"""Newton's steps to a distorted position; each doubles the digits, except near that distance."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -25,6 +32,10 @@ class Alignment:
     ``rows`` and ``columns`` are fine pixels downwards and to the right in camera A's view, ``turn_deg`` is
     counter-clockwise, ``magnification`` is m. The effect ``misregistration`` uses the same convention.
 
+    ``distortion`` is k: what would be at q is at p in arm B's view, with p·(1 − k·|p/h|²) = q and h half the
+    field's side. It is the outward displacement of the middle of a side, relative to h, by the lens of arm B,
+    or less that by the lens of arm A, as the effect ``lens_distortion`` has it.
+
     Raises UsageError for values beyond the limits above.
     """
 
@@ -32,9 +43,10 @@ class Alignment:
     columns: float = 0.0
     turn_deg: float = 0.0
     magnification: float = 1.0
+    distortion: float = 0.0
 
     def __post_init__(self) -> None:
-        values = (self.rows, self.columns, self.turn_deg, self.magnification)
+        values = (self.rows, self.columns, self.turn_deg, self.magnification, self.distortion)
         if not all(map(math.isfinite, values)):
             raise UsageError(f"the alignment is impossible: {self}", possible="finite numbers")
         low = 1 / LARGEST_MAGNIFICATION
@@ -42,11 +54,13 @@ class Alignment:
             max(abs(self.rows), abs(self.columns)) <= LARGEST_SHIFT_PIXELS
             and abs(self.turn_deg) <= LARGEST_TURN_DEG
             and low <= self.magnification <= LARGEST_MAGNIFICATION
+            and abs(self.distortion) <= LARGEST_DISTORTION
         ):
             raise UsageError(
                 f"the alignment is impossible: {self}",
                 possible=f"shifts up to {LARGEST_SHIFT_PIXELS:g} fine pixels, turns up to "
-                f"{LARGEST_TURN_DEG:g} degrees, magnification {low:g} to {LARGEST_MAGNIFICATION:g}",
+                f"{LARGEST_TURN_DEG:g} degrees, magnification {low:g} to {LARGEST_MAGNIFICATION:g}, "
+                f"distortion up to {LARGEST_DISTORTION:g}",
             )
 
     @property
@@ -56,13 +70,24 @@ class Alignment:
         rotation = np.array([[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]])
         return self.magnification * rotation
 
-    def to_b(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return where points (2, m, n) of arm A's view are in arm B's, from the centre of the field."""
+    def to_b(self, points: NDArray[np.float64], half: float) -> NDArray[np.float64]:
+        """Return where points (2, m, n) of arm A's view are in arm B's; ``half`` is h."""
         found: NDArray[np.float64] = np.tensordot(self.matrix, points, axes=1) + self._shift
-        return found
+        if not self.distortion:
+            return found
+        k, aim = self.distortion / half**2, np.hypot(*found)
+        if k > 0:
+            # beyond this distance nothing is imaged
+            aim = np.minimum(aim, 0.999 * 2 / 3 / np.sqrt(3 * k))
+        radius = aim
+        for _ in range(ROUNDS):
+            radius = radius - (radius * (1 - k * radius**2) - aim) / (1 - 3 * k * radius**2)
+        return np.asarray(found / (1 - k * radius**2))
 
-    def to_a(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return where points (2, m, n) of arm B's view are in arm A's, from the centre of the field."""
+    def to_a(self, points: NDArray[np.float64], half: float) -> NDArray[np.float64]:
+        """Return where points (2, m, n) of arm B's view are in arm A's; ``half`` is h."""
+        if self.distortion:
+            points = points * (1 - self.distortion / half**2 * (points**2).sum(axis=0))
         return np.tensordot(np.linalg.inv(self.matrix), points - self._shift, axes=1)
 
     @property
@@ -72,7 +97,7 @@ class Alignment:
     def sources(self, size: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return the row and column (size, size) of arm A's view that each fine pixel of arm B's shows."""
         centre = (size - 1) / 2
-        rows, columns = self.to_a(np.indices((size, size), np.float64) - centre)
+        rows, columns = self.to_a(np.indices((size, size), np.float64) - centre, size / 2)
         return rows + centre, columns + centre
 
     def facts(self) -> dict[str, Any]:
@@ -82,4 +107,5 @@ class Alignment:
             "columns": self.columns,
             "turn_deg": self.turn_deg,
             "magnification": self.magnification,
+            "distortion": self.distortion,
         }

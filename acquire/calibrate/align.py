@@ -1,9 +1,10 @@
-"""Alignment of arm B's image with arm A's: shift, rotation and magnification, from a textured target at rest.
+"""Alignment of arm B's image with arm A's: shift, rotation, magnification, distortion, from a target at rest.
 
 Arm A's image is finely sampled along rows, arm B's along columns (`still`), and both are box-filtered alike.
 They are compared where a coarse column of A meets a coarse row of B in the scene, so that each is
 interpolated only along its own fine axis, where it is well sampled. Each point gives the displacement along
-one direction of texture. Over the field these give shift, rotation and magnification by least squares.
+one direction of texture. Over the field these give shift, rotation and magnification by least squares, and
+the radial distortion if there is one.
 """
 
 from __future__ import annotations
@@ -15,7 +16,8 @@ import numpy as np
 from scipy.ndimage import gaussian_filter, map_coordinates, spline_filter
 from scipy.optimize import least_squares
 
-from acquire.alignment import Alignment
+from acquire.alignment import LARGEST_DISTORTION, Alignment
+from acquire.blur import falling
 from acquire.calibrate.calibration import AlignmentFound
 from acquire.errors import UsageError
 
@@ -29,12 +31,46 @@ SMOOTHINGS = (4.0, 0.0)
 """Smoothing of the images in fine pixels: coarse first, so that a start some pixels off converges."""
 EDGE = 4
 """Fine pixels at the rim that are not compared, since splines and dark columns affect them."""
-NUMBERS = ("rows", "columns", "turn_deg", "magnification")
+NUMBERS = ("rows", "columns", "turn_deg", "magnification", "distortion")
+BRIGHTNESS = (4, 5)
+"""Places among the fitted numbers of the factor and the offset of arm B's brightness."""
+DISTORTED_PIXELS, DISTORTED_SURE = 0.05, 5.0
+"""Least distortion that counts, in fine pixels at the middle of a side and in standard uncertainties."""
+LEAST_FALL, FALL_SURE = 0.015, 8.0
+"""Least fall of the light from the centre to a side that counts, as a part and in standard uncertainties."""
+POINT_ROUNDS = 5
+"""Rounds to a point's position in both images, each of which reduces its error by twice the distortion."""
 WORST_PIXELS = 0.2
 """Uncertainty of shift, turn or magnification, in fine pixels at the field's edge, beyond which an alignment
 is useless, as from a target without texture."""
 LEAST_CORRELATION = 0.5
 """Of the two images where they meet. Without texture, noise alone may seem to determine an alignment."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FallOff:
+    """What a lens takes of the light on A's rows and B's columns: r₁, r₂, c₁, c₂, and their uncertainties.
+
+    ``brightness`` is the light of arm B over that of arm A in the centre.
+    """
+
+    terms: NDArray[np.float64]
+    errors: NDArray[np.float64]
+    brightness: float
+
+    @property
+    def clear(self) -> bool:
+        """Whether there is any."""
+        return bool(self._clear.any())
+
+    @property
+    def in_b(self) -> bool:
+        """Whether there is any along the transfer of arm B, where a field's end does not look like it."""
+        return bool(self._clear[2:].any())
+
+    @property
+    def _clear(self) -> NDArray[np.bool_]:
+        return np.asarray(np.abs(self.terms) > np.maximum(LEAST_FALL, FALL_SURE * self.errors))
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,6 +84,7 @@ class Match:
     found: AlignmentFound
     misfit: float
     brightness: float
+    fall_off: FallOff
 
 
 def align(a: Still, b: Still, geometry: Geometry, start: tuple[float, float] = (0.0, 0.0)) -> Match:
@@ -56,7 +93,43 @@ def align(a: Still, b: Still, geometry: Geometry, start: tuple[float, float] = (
     Raises UsageError if the target has too little texture to determine the alignment.
     """
     images = _Images(a, b, geometry)
-    numbers = np.array([*start, 0.0, 0.0, 1.0, 0.0])
+    fit = _fit(images, np.array([*start, 0.0, 0.0, 1.0, 0.0]))
+    if not fit.determined:
+        raise _undetermined()
+    distorted = _fit(images, np.append(fit.numbers, 0.0))
+    half = geometry.size / 2
+    moved, sure = (float(half * each) for each in (distorted.alignment.distortion, distorted.errors[-1]))
+    if distorted.determined and abs(moved) > max(DISTORTED_PIXELS, DISTORTED_SURE * sure):
+        fit = distorted
+    comparison, numbers = fit.comparison, fit.numbers
+    if comparison.correlation(numbers) < LEAST_CORRELATION:
+        raise _undetermined()
+    errors = np.delete(fit.errors, BRIGHTNESS).tolist()
+    uncertainty = dict(zip(NUMBERS, errors, strict=False))
+    found = AlignmentFound(fit.alignment, uncertainty)
+    return Match(
+        found, comparison.misfit(numbers), comparison.brightness(numbers), comparison.fall_off(numbers)
+    )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Fit:
+    """Fitted ``numbers`` of a `_Comparison`, and the uncertainties of what they mean (inf: undetermined)."""
+
+    comparison: _Comparison
+    numbers: NDArray[np.float64]
+    alignment: Alignment
+    errors: NDArray[np.float64]
+
+    @property
+    def determined(self) -> bool:
+        """Whether no number displaces the field's edge by an unknown amount."""
+        pixels = self.errors / _units(self.comparison.geometry)[: len(self.errors)]
+        return bool(np.delete(pixels, BRIGHTNESS).max() <= WORST_PIXELS)
+
+
+def _fit(images: _Images, numbers: NDArray[np.float64]) -> _Fit:
+    """Fit the ``numbers`` from a start, with the distortion if there are seven."""
     for sigma in SMOOTHINGS:
         comparison = _Comparison(images, sigma)
         # Outliers are identified by the spread of the differences, far above the noise in clean images.
@@ -66,28 +139,23 @@ def align(a: Still, b: Still, geometry: Geometry, start: tuple[float, float] = (
             solved = least_squares(
                 comparison,
                 numbers,
-                x_scale=comparison.scale,
+                x_scale=comparison.scale[: len(numbers)],
                 # scipy's `lm` has no robust loss
                 method="trf",
                 loss=loss,
                 f_scale=max(1.0, spread),
             )
             numbers = solved.x
-    alignment = _alignment(numbers, geometry)
     freedom = max(1, len(solved.fun) - len(numbers))
+    units = _units(images.geometry)[: len(numbers)]
     try:
         jacobian = np.asarray(solved.jac, np.float64)
         # scipy's cost is half the sum of squares.
         covariance = np.linalg.inv(jacobian.T @ jacobian) * 2 * solved.cost / freedom
-    except np.linalg.LinAlgError as error:
-        raise _undetermined() from error
-    errors = np.sqrt(np.diag(covariance))
-    determined = errors[: len(NUMBERS)].max() <= WORST_PIXELS
-    if not (determined and comparison.correlation(numbers) >= LEAST_CORRELATION):
-        raise _undetermined()
-    uncertainty = dict(zip(NUMBERS, (errors * _units(geometry)).tolist(), strict=False))
-    found = AlignmentFound(alignment, uncertainty)
-    return Match(found, comparison.misfit(numbers), comparison.brightness(numbers))
+        errors = np.sqrt(np.diag(covariance)) * units
+    except np.linalg.LinAlgError:
+        errors = np.full(len(numbers), np.inf)
+    return _Fit(comparison, numbers, _alignment(numbers, images.geometry), errors)
 
 
 def _undetermined() -> UsageError:
@@ -98,14 +166,17 @@ def _undetermined() -> UsageError:
 
 
 def _units(geometry: Geometry) -> NDArray[np.float64]:
-    """Return the units of the six fitted numbers: those of rotation and magnification at the field's edge."""
+    """Return the units of the fitted numbers: rotation, magnification and distortion at the field's edge."""
     half = geometry.size / 2
-    return np.array([1, 1, np.rad2deg(1 / half), 1 / half, 1, 1])
+    return np.array([1, 1, np.rad2deg(1 / half), 1 / half, 1, 1, 1 / half])
 
 
 def _alignment(numbers: NDArray[np.float64], geometry: Geometry) -> Alignment:
-    rows, columns, turn, larger = (numbers * _units(geometry))[:4].tolist()
-    return Alignment(rows, columns, turn, 1 + larger)
+    values = np.delete(numbers * _units(geometry)[: len(numbers)], BRIGHTNESS)
+    rows, columns, turn, larger, *distortion = values.tolist()
+    # a step of the fit may go too far
+    clipped = np.clip(distortion, -LARGEST_DISTORTION, LARGEST_DISTORTION).tolist()
+    return Alignment(rows, columns, turn, 1 + larger, *clipped)
 
 
 class _Images:
@@ -120,14 +191,15 @@ class _Images:
 
 
 class _Comparison:
-    """Differences of the images at the points where their lattices cross, as a function of six numbers.
+    """Differences of the images at the points where their lattices cross, as a function of six or 7 numbers.
 
-    These are the shift (2), rotation and magnification as pixels at the field's edge, and the factor and
-    offset of B's brightness relative to A's.
+    These are the shift (2), rotation and magnification as pixels at the field's edge, the factor and offset
+    of B's brightness relative to A's, and the distortion as pixels at the middle of a side.
     """
 
     def __init__(self, images: _Images, sigma: float) -> None:
-        self._images, geometry = images, images.geometry
+        self._images, self.geometry = images, images.geometry
+        geometry = self.geometry
         n, S = geometry.size, geometry.substeps
         self._n, self._S, self._middle = n, S, (n - 1) / 2
         a, b = images.a, images.b
@@ -141,11 +213,12 @@ class _Comparison:
         good = images.rows[:, None] & images.columns
         inside = (np.abs(coarse - self._middle) < self._middle - EDGE)[:, None]
         self._good = good & inside & inside.T
-        self.scale = np.array([0.1, 0.1, 0.1, 0.1, 0.01, 0.01 * max(float(np.abs(a).mean()), 1e-12)])
+        level = max(float(np.abs(a).mean()), 1e-12)
+        self.scale = np.array([0.1, 0.1, 0.1, 0.1, 0.01, 0.01 * level, 0.1])
         self._level = float(a.std())
 
     def __call__(self, numbers: NDArray[np.float64]) -> NDArray[np.float64]:
-        a, b, inside = self._pairs(numbers)
+        a, b, inside, _ = self._pairs(numbers)
         # 0 outside, because `least_squares` needs the same number of residuals in every call
         residual = np.where(inside, b - numbers[4] * a - numbers[5], 0.0)[self._good]
         weighted: NDArray[np.float64] = residual * self._images.weight
@@ -153,7 +226,7 @@ class _Comparison:
 
     def misfit(self, numbers: NDArray[np.float64]) -> float:
         """Return the RMS of the differences, relative to the images' variation."""
-        a, b, inside = self._pairs(numbers)
+        a, b, inside, _ = self._pairs(numbers)
         residual = (b - numbers[4] * a - numbers[5])[self._good & inside]
         if not residual.size:
             return float("inf")
@@ -161,7 +234,7 @@ class _Comparison:
 
     def correlation(self, numbers: NDArray[np.float64]) -> float:
         """Return the correlation coefficient of the images; 0 where either is uniform."""
-        a, b, inside = self._pairs(numbers)
+        a, b, inside, _ = self._pairs(numbers)
         a, b = (image[self._good & inside] for image in (a, b))
         if a.size < 2 or not (a.std() > 0 and b.std() > 0):
             return 0.0
@@ -169,20 +242,58 @@ class _Comparison:
 
     def brightness(self, numbers: NDArray[np.float64]) -> float:
         """Return B's light over A's; not the fitted factor, which blur and noise of each image lower."""
-        a, b, inside = self._pairs(numbers)
+        a, b, inside, _ = self._pairs(numbers)
         common = self._good & inside
         total = float(a[common].sum())
         return float(b[common].sum()) / total if total > 0 else 1.0
 
-    def _pairs(self, numbers: NDArray[np.float64]) -> tuple[NDArray[Any], NDArray[Any], NDArray[np.bool_]]:
-        """Return A and B where they show the same point, and whether both cover it."""
-        # Row y of B and column x of A show one point if (y, q) − middle = m·Q·((p, x) − middle) + shift:
-        # two equations, linear in p, the row of A, and q, the column of B.
-        alignment = _alignment(numbers, self._images.geometry)
+    def fall_off(self, numbers: NDArray[np.float64]) -> FallOff:
+        """Fit B = A·(1 + c₁·x + c₂·x²)/(1 + r₁·y + r₂·y²), with A's row y and B's column x from −1 to 1."""
+        a, b, inside, (y, x) = self._pairs(numbers)
+        common = self._good & inside
+        a, b, y, x = (each[common] for each in (a, b, y, x))
+
+        def light(terms: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+            r1, r2, c1, c2 = terms[:4]
+            return falling((r1, r2), y), falling((c1, c2), x)
+
+        def residual(terms: NDArray[np.float64]) -> NDArray[np.float64]:
+            rows, columns = light(terms)
+            return np.asarray((b - terms[4] * a * columns / rows - terms[5]) * self._images.weight)
+
+        start = np.array([0, 0, 0, 0, numbers[4], numbers[5]])
+        spread = float(np.median(np.abs(residual(start)))) / 0.6745
+        # within the bounds both are above 0
+        most = np.array([0.4, 0.5, 0.4, 0.5, np.inf, np.inf])
+        solved = least_squares(
+            residual, start, bounds=(-most, most), loss="soft_l1", f_scale=max(1.0, spread), x_scale="jac"
+        )
+        jacobian = np.asarray(solved.jac, np.float64)
+        freedom = max(1, len(a) - len(start))
+        errors = np.sqrt(np.diag(np.linalg.pinv(jacobian.T @ jacobian)) * 2 * solved.cost / freedom)
+        rows, columns = light(solved.x)
+        return FallOff(solved.x[:4], errors[:4], float((b / columns).sum() / (a / rows).sum()))
+
+    def _pairs(
+        self, numbers: NDArray[np.float64]
+    ) -> tuple[NDArray[Any], NDArray[Any], NDArray[np.bool_], tuple[NDArray[Any], NDArray[Any]]]:
+        """Return A and B where they show the same point, whether both cover it, and A's row and B's column.
+
+        The last two are from −1 to 1 over the field.
+        """
+        # Row y of B and column x of A show one point if (y, q)·f = m·Q·(p, x) + shift, all from the middle:
+        # two equations, linear in p, the row of A, and q, the column of B. Without distortion f is 1.
+        alignment = _alignment(numbers, self.geometry)
         (d, e), (f, g) = alignment.matrix
-        y, x = self._b_rows - self._middle - alignment.rows, self._a_columns - self._middle
-        p = (y - e * x) / d
+        y, x = self._b_rows - self._middle, self._a_columns - self._middle
+        p = (y - alignment.rows - e * x) / d
         q = f * p + g * x + alignment.columns
+        if alignment.distortion:
+            k = alignment.distortion / (self._n / 2) ** 2
+            for _ in range(POINT_ROUNDS):
+                factor = 1 - k * (y**2 + q**2)
+                p = (y * factor - alignment.rows - e * x) / d
+                q = (f * p + g * x + alignment.columns) / factor
         at_a_row, at_b_column = p + self._middle, q + self._middle
         # row m of an image is the sum over S fine rows up to m, and is centred (S − 1)/2 before it
         half = (self._S - 1) / 2
@@ -194,4 +305,4 @@ class _Comparison:
         b = map_coordinates(self._b, [rows_b, columns_b], order=3, mode="nearest", prefilter=False)
         low, high = EDGE, self._n - 1 - EDGE
         inside = (at_a_row > low) & (at_a_row < high) & (at_b_column > low) & (at_b_column < high)
-        return a, b, inside
+        return a, b, inside, (p / (self._n / 2), q / (self._n / 2))

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from acquire.blur import Blur
+from acquire.blur import Blur, falling
 from acquire.calibrate.calibration import COLUMN, QUANTITIES, Calibration, Measured, differences_between
 from acquire.calibrate.curve import curve_of
 from acquire.calibrate.exposure import instrument_of
@@ -118,7 +118,34 @@ def calibrated(segment: Segment, calibration: Calibration) -> Segment:
     if calibration.alignment is not None:
         # measured between the arms as they are turned by then
         corrected = replace(corrected, alignment=calibration.alignment.alignment)
+    if belongs_to_flat(calibration):
+        corrected = shaded(corrected, calibration.quantities["shading"].value)
     return _without_interpolation(corrected)
+
+
+def belongs_to_flat(calibration: Calibration) -> bool:
+    """Return whether the shading was measured with the gains that the calibration has now."""
+    if "shading" not in calibration.quantities or "align" not in calibration.steps:
+        return False
+    made = calibration.steps.get("flat", {}).get("made")
+    return calibration.alignment is not None and calibration.steps["align"].get("shading_of_flat") == made
+
+
+def shaded(segment: Segment, shading: NDArray[np.float64]) -> Segment:
+    """Move the smooth part of the columns' gains from the responsivities to the image in the model."""
+    geometry = segment.geometry
+    fine = (np.arange(geometry.size) - (geometry.size - 1) / 2) / (geometry.size / 2)
+    responsivity = _columns(segment.responsivity_dn, segment)
+    for arm, (r1, r2, c1, c2, _) in enumerate(shading.tolist()):
+        rows, columns = falling((r1, r2), fine), falling((c1, c2), fine)
+        # arm A's pixels are the scene's columns, arm B's its rows
+        own = (rows if arm else columns).reshape(geometry.stages, -1).mean(axis=1)
+        responsivity[arm] *= rows.max() * columns.max() / own
+    # the centre of the lenses passes all light
+    responsivity /= np.sqrt(shading[:, 4].prod())
+    a, b = (tuple(row) for row in shading[:, :4].tolist())
+    blur = replace(segment.blur or Blur((0.0, 0.0), (0.0, 0.0)), shade_a=a, shade_b=b)
+    return replace(segment, responsivity_dn=responsivity, blur=blur)
 
 
 def _of_columns(calibration: Calibration, segment: Segment) -> Calibration:
@@ -185,7 +212,7 @@ def _without_interpolation(segment: Segment) -> Segment:
     rows, columns = interpolation_variance(segment.alignment, segment.geometry.size)
     along, across = segment.blur.b  # of arm B's charge, which moves along the scene's columns
     left = (max(0.0, along**2 - columns) ** 0.5, max(0.0, across**2 - rows) ** 0.5)
-    return replace(segment, blur=Blur(segment.blur.a, left))
+    return replace(segment, blur=replace(segment.blur, b=left))
 
 
 def _noise(calibration: Calibration) -> Noise | None:

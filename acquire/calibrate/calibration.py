@@ -13,6 +13,7 @@
     light_late_ticks (arm)           delay of the light relative to the charge, without lead and delays
     linearity_error  (arm)           LE of EMVA 1288
     blur_px          (arm, axis)     standard deviation of the optics' blur, along the transfer and across it
+    shading          (arm, term)     light on the image of the model's arms, relative to its centre
     excess_dn        (arm, knot)     excess of samples that read 0 … white, at evenly spaced knots
 
 and ``usable`` (arm, column), the orientation of arm B, and its alignment with arm A.
@@ -52,6 +53,8 @@ class Quantity:
 
 
 ARM, COLUMN, CURVE, WIDTHS = ("arm",), ("arm", "column"), ("arm", "knot"), ("arm", "axis")
+SHADING = ("arm", "term")
+TERMS = 5
 KNOTS = 65
 """Knots of a camera's curve; between them a bend of a percent is straight to a part in 10⁶."""
 QUANTITIES = {
@@ -72,6 +75,12 @@ QUANTITIES = {
         WIDTHS, "1", "standard deviation of the optics' blur along the transfer and across it, in fine pixels"
     ),
     "linearity_error": Quantity(ARM, "1", "linearity error of EMVA 1288"),
+    "shading": Quantity(
+        SHADING,
+        "1",
+        "light on the image relative to its centre: r1, r2 along the scene's rows, c1, c2 along its columns; "
+        "and the gain in the centre",
+    ),
     "excess_dn": Quantity(CURVE, "DN", "excess of samples that read 0 … white, at evenly spaced knots"),
 }
 
@@ -194,7 +203,7 @@ class Calibration:
         )
 
     def __post_init__(self) -> None:
-        sizes = {"arm": len(ARMS), "column": self.instrument.columns, "knot": KNOTS, "axis": 2}
+        sizes = {"arm": len(ARMS), "column": self.instrument.columns, "knot": KNOTS, "axis": 2, "term": TERMS}
         columns = tuple(sizes[dimension] for dimension in COLUMN)
         if self.usable is not None and self.usable.shape != columns:
             raise UsageError(
@@ -350,7 +359,8 @@ def _step(attrs: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _alignment(attrs: Mapping[str, Any]) -> AlignmentFound:
-    numbers = {key: float(attrs[key]) for key in Alignment().facts()}
+    # calibrations from before the distortion was measured have none
+    numbers = {key: float(attrs[key]) for key in Alignment().facts() if key in attrs or key != "distortion"}
     return AlignmentFound(Alignment(**numbers), {k: float(v) for k, v in attrs["uncertainty"].items()})
 
 

@@ -134,12 +134,15 @@ def _alignment(found: Finding, known: Calibration) -> Iterator[Compared]:
     # without an alignment, a reconstruction takes the arms to coincide
     then = before.alignment.facts() if before else {"magnification": 1.0}
     errors = before.uncertainty if before else {}
-    # a magnification is compared by what it displaces at the field's edge
+    # magnification and distortion are compared by what they displace at the field's edge
     half = known.instrument.stages * known.instrument.substeps / 2
     scales = {"rows": (1.0, "pixels"), "columns": (1.0, "pixels"), "turn_deg": (1.0, "turn_deg")}
-    for name, (scale, kind) in (scales | {"magnification": (half, "pixels")}).items():
+    for name, (scale, kind) in (
+        scales | dict.fromkeys(("magnification", "distortion"), (half, "pixels"))
+    ).items():
         change = (now.alignment.facts()[name] - then.get(name, 0.0)) * scale
-        sure = float(np.hypot(now.uncertainty[name], errors.get(name, 0.0))) * scale
+        # a distortion that is 0 has no uncertainty
+        sure = float(np.hypot(now.uncertainty.get(name, 0.0), errors.get(name, 0.0))) * scale
         unit = "degrees" if kind == "turn_deg" else "fine pixels"
         yield Compared(name, unit, change, sure, MATTERS[kind])
 

@@ -26,6 +26,7 @@ BETTER = 0.25
 """Largest squared error of the ending field, relative to the unlimited one, with which it is accepted."""
 LEAST_LIGHT = 0.3
 """Least share of its light with which a column's gain is still computed."""
+PARABOLA = 2
 BALANCE_ERROR = 5e-4
 """Uncertainty of the balance from some hundredths of a pixel in the alignment."""
 
@@ -41,11 +42,14 @@ def profile(alignment: Alignment, stages: int, substeps: int) -> NDArray[np.floa
     return lit
 
 
-def without_field_edge(known: Calibration, alignment: Alignment) -> dict[str, Measured]:
+def without_field_edge(
+    known: Calibration, alignment: Alignment, *, dimmed: bool = False
+) -> dict[str, Measured]:
     """Return gain and balance without the profile of a flat that ends at the field's edge; else nothing.
 
     ``known`` holds the flat, and the orientation if it was measured. Columns that `flat` left at 1, because
-    the edge is blurred, stay there.
+    the edge is blurred, stay there. ``dimmed``: a lens takes light towards the edges, which is not where the
+    field ends; the columns at the edge are then compared with a parabola through the others.
     """
     step = known.steps.get("flat", {})
     if not {"gain", "balance"} <= known.quantities.keys() or "edge_response" not in step:
@@ -62,6 +66,11 @@ def without_field_edge(known: Calibration, alignment: Alignment) -> dict[str, Me
     # `flat` has set these gains to 1; here their response counts
     response[list(hidden)] = list(hidden.values())
     witnesses = lit < 1 - TELLS
+    others = ~witnesses
+    others[list(hidden)] = False
+    if dimmed and others.sum() > PARABOLA:
+        x = np.linspace(-1, 1, len(response))
+        response /= np.polynomial.Polynomial.fit(x[others], response[others], PARABOLA, [-1, 1])(x)
     ending, unlimited = (float(((response - each)[witnesses] ** 2).sum()) for each in (lit, 1.0))
     if not witnesses.any() or ending > BETTER * unlimited:
         return {}

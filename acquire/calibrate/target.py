@@ -7,9 +7,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from acquire.blur import falling
 from acquire.calibrate.align import Match, align
 from acquire.calibrate.apply import calibrated
-from acquire.calibrate.calibration import Finding, Measured, TileAlignment
+from acquire.calibrate.calibration import TERMS, Finding, Measured, TileAlignment
 from acquire.calibrate.field import without_field_edge
 from acquire.calibrate.orientation import (
     CLEAR,
@@ -23,6 +24,8 @@ from acquire.calibrate.still import stills
 from acquire.errors import UsageError
 
 if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
     from acquire.calibrate.calibration import Calibration
     from acquire.calibrate.exposure import Exposure
     from acquire.calibrate.still import Still
@@ -99,9 +102,20 @@ def alignment(exposure: Exposure, known: Calibration) -> Finding:
     # the shift is in blocks of S fine pixels
     match = align(still_a, still_b, geometry, (S * shift[0], S * shift[1]))
     # now that the alignment shows which columns of arm B look beyond the field
-    quantities = without_field_edge(known, match.found.alignment)
+    quantities = without_field_edge(known, match.found.alignment, dimmed=match.fall_off.in_b)
     ends = bool(quantities)
-    if not ends:
+    shading: dict[str, Measured] = {}
+    if "gain" in known.quantities and not known.steps.get("flat", {}).get("smooth", True):
+        corrected = replace(known, quantities={**known.quantities, **quantities})
+        if ends:
+            # with the gains as they are now
+            segment = _segment(exposure, replace(corrected, alignment=None))
+            match = align(*stills(segment), geometry, (S * shift[0], S * shift[1]))
+        shading = _shading(corrected, exposure, match)
+    if shading:
+        match = replace(match, brightness=match.fall_off.brightness)
+        quantities = {**quantities, **shading, **_balance(corrected, match)}
+    elif not ends:
         quantities = _balance(known, match)
     facts = {
         **exposure.facts(),
@@ -110,6 +124,7 @@ def alignment(exposure: Exposure, known: Calibration) -> Finding:
         "misfit": round(match.misfit, 4),
         "lines_misfit": [round(still_a.misfit, 5), round(still_b.misfit, 5)],
         "brightness": round(match.brightness, 5),
+        "shading_of_flat": known.steps["flat"].get("made") if shading else None,
     }
     warnings = []
     if ends:
@@ -117,10 +132,15 @@ def alignment(exposure: Exposure, known: Calibration) -> Finding:
             "the flat's light ends at the field's edge, and arm B sees beyond it: gain and balance are "
             "corrected, but a larger white scene is better"
         )
-    elif quantities:
+    elif "balance" in quantities and not shading:
         warnings.append(
             f"over the field that both arms see, arm B is {match.brightness - 1:+.1%} brighter than in the "
             "flat: the balance is corrected"
+        )
+    if shading:
+        least = min(float(light.min()) for light in _lights(shading["shading"].value))
+        warnings.append(
+            f"the light falls to {least:.0%} towards a side, by lens or lamp: the model includes it"
         )
     return Finding(
         "align",
@@ -163,6 +183,48 @@ def tile_alignments(exposure: Exposure, known: Calibration) -> Finding:
         )
     facts = {**exposure.facts(), "lines": lines, "tiles": len(found)}
     return Finding("align", exposure.instrument, facts=facts, warnings=tuple(warnings), tiles=tuple(found))
+
+
+def _shading(known: Calibration, exposure: Exposure, match: Match) -> dict[str, Measured]:
+    """Return what each lens takes of the light; nothing if the arms' images do not show it.
+
+    A flat gives the profile of arm A's columns and of arm B's, which are the scene's rows: it is in their
+    gains. With gains that contain it, arm A's image still has the profile of its rows and arm B's that of the
+    scene's columns, which their ratio shows. Columns whose gain `flat` has set to 1, since they are dark, get
+    the profile instead.
+    """
+    if not match.fall_off.clear:
+        return {}
+    r1, r2, c1, c2 = match.fall_off.terms
+    rows, columns = match.fall_off.errors[:2], match.fall_off.errors[2:]
+    bare, measured = replace(exposure, lines=2).whole(), known.quantities["gain"]
+    places = np.arange(measured.value.size, dtype=np.float64).reshape(measured.value.shape)
+    # from 1, since a responsivity is above 0
+    numbered = replace(bare, responsivity_dn=places + 1)
+    # the places of the model's arms and columns among the cameras'
+    at = np.asarray(calibrated(numbered, replace(known, quantities={}, alignment=None)).responsivity_dn)
+    at = at.astype(np.int64) - 1
+    gains, filled = measured.value.ravel()[at], measured.value.ravel().copy()
+    seen = calibrated(bare, replace(known, alignment=None)).mask.any(axis=1)
+    x = (np.arange(gains.shape[1]) + 0.5) * 2 / gains.shape[1] - 1
+    values, errors = np.zeros((2, TERMS)), np.zeros((2, TERMS))
+    for arm, (gain, good) in enumerate(zip(gains, seen & (gains != 1.0), strict=True)):
+        design = np.stack([np.ones_like(x), x, x**2], axis=1)[good]
+        fitted, residual, *_ = np.linalg.lstsq(design, gain[good], rcond=None)
+        spread = float(residual.sum()) / max(1, good.sum() - 3)
+        doubt = np.sqrt(np.diag(np.linalg.inv(design.T @ design)) * spread)
+        own, sure = fitted[1:] / fitted[0], doubt[1:] / fitted[0]
+        assumed = gain == 1.0
+        filled[at[arm, assumed]] = falling(tuple(own), x[assumed]) * fitted[0]
+        values[arm] = [*own, c1, c2, fitted[0]] if arm else [r1, r2, *own, fitted[0]]
+        errors[arm] = [*sure, *columns, doubt[0]] if arm else [*rows, *sure, doubt[0]]
+    gains_filled = Measured(filled.reshape(measured.value.shape), measured.uncertainty)
+    return {"shading": Measured(values, errors), "gain": gains_filled}
+
+
+def _lights(shading: NDArray[np.float64]) -> list[NDArray[np.float64]]:
+    x = np.linspace(-1, 1, 65)
+    return [falling(tuple(row[i : i + 2]), x) for row in shading for i in (0, 2)]
 
 
 def _balance(known: Calibration, match: Match) -> dict[str, Measured]:

@@ -168,12 +168,18 @@ def _both(measured: Measured, unit: str) -> str:
 
 def _alignment(found: AlignmentFound) -> dict[str, str]:
     numbers, errors = found.alignment, found.uncertainty
-    return {
+    facts = {
         "arm B lies": f"{numbers.rows:+.3f} ± {errors['rows']:.3f} fine pixels down, "
         f"{numbers.columns:+.3f} ± {errors['columns']:.3f} to the right",
         "turned": f"{numbers.turn_deg:+.4f} ± {errors['turn_deg']:.4f} degrees counter-clockwise",
         "magnified": f"{numbers.magnification:.5f} ± {errors['magnification']:.5f}",
     }
+    if numbers.distortion:
+        facts["distorted"] = (
+            f"{numbers.distortion:+.2%} ± {errors.get('distortion', 0.0):.2%} of half the field outwards, "
+            "in the middle of a side"
+        )
+    return facts
 
 
 def _tiles(found: Sequence[TileAlignment]) -> dict[str, str]:

@@ -196,7 +196,7 @@ def align(
     end: ToOption = None,
     json: JsonFlag = False,
 ) -> None:
-    """Measure how arm B's image lies on arm A's: shift, rotation and magnification.
+    """Measure how arm B's image lies on arm A's: shift, rotation, magnification, radial distortion.
 
     Place a stationary target before the lens that fills the field with sharp texture, dots or bars of 2 to 6
     fine pixels, and record with the usual pseudo-random code. 1024 lines give 0.02 fine pixels; 263 are too

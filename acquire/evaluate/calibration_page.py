@@ -107,7 +107,7 @@ def _field(known: Calibration) -> Figure | None:
     alignment, half = known.alignment.alignment, known.instrument.stages * known.instrument.substeps / 2
     at = np.linspace(-0.9 * half, 0.9 * half, SPOKES)
     points = np.stack(np.meshgrid(at, at, indexing="ij")).reshape(2, -1)
-    displacement = alignment.matrix @ points + np.array([[alignment.rows], [alignment.columns]]) - points
+    displacement = alignment.to_b(points[:, :, None], half)[:, :, 0] - points
     largest = float(np.hypot(*displacement).max())
     factor = max((each for each in ENLARGED if each * largest < at[1] - at[0]), default=1)
     figure = canvas(4.6)

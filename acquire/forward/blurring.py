@@ -20,6 +20,7 @@ import numpy as np
 from scipy.optimize import brentq
 
 from acquire.arrays import HOST
+from acquire.blur import falling
 from acquire.forward.merge import block_bounds
 
 if TYPE_CHECKING:
@@ -68,21 +69,35 @@ def blur_matrices(
 
     Arm A's charge moves from row to row of the scene, arm B's from column to column.
     """
-    along_a, across_a, along_b, across_b = (
-        blur_matrix(sigma, size, spatial_merge) for sigma in (*blur.a, *blur.b)
-    )
-    return [(along_a, across_a), (across_b, along_b)]
+    (along_a, across_a), (along_b, across_b) = blur.a, blur.b
+    found = []
+    for sigmas, shade in (((along_a, across_a), blur.shade_a), ((across_b, along_b), blur.shade_b)):
+        rows, columns = (
+            blur_matrix(sigma, size, spatial_merge, shade[i : i + 2])
+            for sigma, i in zip(sigmas, (0, 2), strict=True)
+        )
+        found.append((rows, columns))
+    return found
 
 
 @lru_cache(maxsize=32)
-def blur_matrix(sigma: float, size: int, spatial_merge: int = 1) -> NDArray[np.float64]:
-    """Return the blur of one axis (n′, n′) by a kernel with a standard deviation of ``sigma`` fine pixels."""
+def blur_matrix(
+    sigma: float, size: int, spatial_merge: int = 1, shade: tuple[float, ...] = (0.0, 0.0)
+) -> NDArray[np.float64]:
+    """Return the blur of one axis (n′, n′) by a kernel with a standard deviation of ``sigma`` fine pixels.
+
+    ``shade`` is what the lens takes of the light before; see `Blur`.
+    """
     weights = kernel(sigma)
     reach = len(weights) // 2
     at = np.arange(size)[:, None]
     fine = np.zeros((size, size))
     for distance, weight in zip(range(-reach, reach + 1), weights, strict=True):
         np.add.at(fine, (at, np.clip(at + distance, 0, size - 1)), weight)
+    if any(shade):
+        light = falling(shade, (np.arange(size) - (size - 1) / 2) / (size / 2))
+        # at most 1, so that the bound of ‖Λ′‖ holds with a lens as without
+        fine *= light / light.max()
     if spatial_merge > 1:
         starts, lengths = block_bounds(size, spatial_merge)
         # sums along columns (a voxel is held over them), means along rows: rows of the matrix still sum to 1

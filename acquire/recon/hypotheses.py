@@ -71,16 +71,16 @@ def _transposed(scene: Scene) -> Scene:
     return np.asarray(np.repeat(merged.transpose(2, 1, 0), finer, axis=0))
 
 
-def _displaced(scene: Scene, size: int, sources: Callable[[Floats], Floats]) -> Scene:
+def _displaced(scene: Scene, size: int, sources: Callable[[Floats, float], Floats]) -> Scene:
     """The scene as it appears in another view, whose points show what lies at ``sources`` in this one.
 
-    Points (2, …) are in fine pixels from the centre of a field of ``size``. Beyond its edge, the edge
-    continues.
+    Points (2, …) are in fine pixels from the centre of a field of ``size``, and come with half of it. Beyond
+    its edge, the edge continues.
     """
     rows, cosines, pixels = scene.shape
     cell = size / np.array([[[rows]], [[pixels]]])
     centre = (np.array([[[rows]], [[pixels]]]) - 1) / 2
-    found = sources((np.indices((rows, pixels)) - centre) * cell) / cell + centre
+    found = sources((np.indices((rows, pixels)) - centre) * cell, size / 2) / cell + centre
     views = [map_coordinates(scene[:, k], found, order=1, mode="nearest") for k in range(cosines)]
     return np.stack(views, axis=1)
 

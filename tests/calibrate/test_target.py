@@ -5,17 +5,20 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from instruments import COLUMNS, NOISE, N, S, columns_truth, dots, record, white
 
+from acquire.alignment import Alignment
 from acquire.calibrate import Calibration, Measured, calibrated
 from acquire.calibrate.columns import dark, flat
 from acquire.calibrate.exposure import instrument_of, open_exposure
 from acquire.calibrate.orientation import MODEL, VIEWS, View, oriented
 from acquire.calibrate.still import stills
 from acquire.calibrate.target import alignment, orientation
+from acquire.calibrate.words import found_facts
 from acquire.errors import UsageError
 from acquire.forward import DualArm
 from acquire.sim.scenes import build_scene
@@ -113,6 +116,37 @@ def test_shift_and_turn_to_some_hundredths(tmp_path: Path, off: dict[str, float]
         assert error < 8 * found.uncertainty[name]
 
 
+@pytest.mark.parametrize("part", [0.03, -0.02])
+def test_a_lens_that_distorts_arm_b_is_measured(tmp_path: Path, part: float) -> None:
+    """Without it, the similarity that fits best leaves most of the arms' difference."""
+    off = {"rows": 1.5, "columns": -1.0, "turn_deg": 0.4, "beyond": "edge"}
+    lens = {"kind": "lens_distortion", "arm": "b", "part": part}
+    scene = dots(tmp_path, [*NOISE, {"kind": "misregistration", **off}, lens])
+    path = record(tmp_path / "target.zarr", scene, "target", 768)
+    found = alignment(open_exposure(path), empty(path))
+    assert found.alignment is not None
+    at = found.alignment.alignment
+    assert at.distortion == pytest.approx(part, abs=0.004)  # 0.14 fine pixels
+    assert at.magnification == pytest.approx(1, abs=2e-3)
+    assert at.rows == pytest.approx(1.5, abs=0.08)
+    assert "outwards" in found_facts(found)["distorted"]
+    picture = build_scene(scene, N, 1e-5).frames(0, 1)
+    segment = replace(open_recording(path).cut(0, 256), alignment=at)
+
+    def difference(arrangement: Alignment) -> float:
+        operator = DualArm(segment.geometry, segment.code, 1, segment.geometry.span, alignment=arrangement)
+        return float((segment.samples()[1] - operator.forward(picture)[1]).std())
+
+    assert difference(at) < 0.7 * difference(replace(at, distortion=0.0, magnification=1 + at.distortion / 2))
+
+
+def test_coinciding_lenses_have_no_distortion(recordings: dict[str, Path], known: Calibration) -> None:
+    found = alignment(open_exposure(recordings["target"]), known)
+    assert found.alignment is not None
+    assert found.alignment.alignment.distortion == 0
+    assert "distorted" not in found_facts(found)
+
+
 def test_a_flat_that_ends_at_the_fields_edge_is_corrected(
     recordings: dict[str, Path], known: Calibration
 ) -> None:
@@ -195,3 +229,48 @@ def test_dead_columns_are_left_out(tmp_path: Path, recordings: dict[str, Path], 
     found = alignment(open_exposure(recordings["target"]), holed).alignment
     assert found is not None
     assert found.alignment.rows == pytest.approx(1.5, abs=0.06)
+
+
+@pytest.mark.parametrize(
+    "lens", [{"loss": 0.3}, {"loss": 0.4, "rows": 8.0, "columns": -6.0}, {"loss": 0.3, "arm": "b"}]
+)
+def test_a_lens_that_dims_the_edges_is_in_the_model(tmp_path: Path, lens: dict[str, Any]) -> None:
+    """Gains alone would divide each arm by the profile across its own transfer, and make the arms differ."""
+    off = {"kind": "misregistration", "rows": 0.6, "columns": -0.4, "beyond": "edge"}
+    effects = [*NOISE, *COLUMNS, off, {"kind": "vignetting", **lens}]
+    scenes = {"dark": white(effects=effects), "flat": white(effects=effects)}
+    scene = dots(tmp_path, effects)
+    taken = {name: record(tmp_path / f"{name}.zarr", each, name, 1024) for name, each in scenes.items()}
+    taken["target"] = record(tmp_path / "target.zarr", scene, "target", 1024)
+    first = dark(open_exposure(taken["dark"]))
+    known = Calibration(first.instrument).with_step(first)
+    known = known.with_step(flat(open_exposure(taken["flat"]), known))
+    found = alignment(open_exposure(taken["target"]), known)
+    assert "the light falls to" in " ".join(found.warnings)
+    whole = known.with_step(found)
+    picture = build_scene(scene, N, 1e-5).frames(0, 1)
+    lines = open_recording(taken["target"]).cut(0, 256)
+
+    def difference(calibration: Calibration) -> float:
+        """Of the lines and the model of the true scene, up to a factor."""
+        segment = calibrated(lines, calibration)
+        operator = DualArm(
+            segment.geometry,
+            segment.code,
+            1,
+            segment.geometry.span,
+            alignment=segment.alignment,
+            blur=segment.blur,
+        )
+        model, samples = operator.forward(picture), segment.samples()
+        return float((samples - model * (samples * model).sum() / (model**2).sum()).std() / samples.std())
+
+    plain = {name: each for name, each in whole.quantities.items() if name != "shading"}
+    assert difference(whole) < 0.8 * difference(replace(whole, quantities=plain))
+    # a flat that is repeated has other gains, which the profile may not belong to
+    again = replace(whole, steps={**whole.steps, "flat": {**whole.steps["flat"], "made": "2020-01-01T00:00"}})
+    assert calibrated(lines, again).blur is None
+
+
+def test_lenses_without_a_fall_of_light_have_none(recordings: dict[str, Path], known: Calibration) -> None:
+    assert "shading" not in alignment(open_exposure(recordings["target"]), known).quantities

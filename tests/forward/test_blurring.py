@@ -36,6 +36,36 @@ def test_a_kernel_is_as_wide_as_was_measured(sigma: float) -> None:
     np.testing.assert_array_equal(weights, weights[::-1])
 
 
+SHADED = Blur((0.7, 0.0), (0.0, 0.9), (0.1, -0.2, 0.0, -0.15), (0.0, -0.3, -0.05, -0.1))
+
+
+@pytest.mark.parametrize("merge", [1, 3])
+def test_what_a_lens_takes_of_the_light_is_in_the_operator(merge: int) -> None:
+    """Relative to the brightest point, and with an exact transpose."""
+    geometry = Geometry(stages=8, substeps=3, lines=20)
+    code = np.random.default_rng(5).integers(0, 2, geometry.span).astype(np.uint8)
+    bare = DualArm(geometry, code, merge, 4, np.float64)
+    shaded = DualArm(geometry, code, merge, 4, np.float64, Alignment(0.4, -0.3), SHADED)
+    rng = np.random.default_rng(6)
+    video, lines = rng.random(bare.video_shape), rng.random(bare.lines_shape)
+    assert (shaded.forward(video) * lines).sum() == pytest.approx((video * shaded.adjoint(lines)).sum())
+    assert shaded.norm_bound() <= bare.norm_bound() * 1.01
+    x = (np.arange(24) - 11.5) / 12
+    rows, columns = 1 + 0.1 * x - 0.2 * x**2, 1 - 0.15 * x**2
+    only = Blur((0.0, 0.0), (0.0, 0.0), SHADED.shade_a, SHADED.shade_b)
+    fine = DualArm(geometry, code, 1, 4, np.float64, blur=only)
+    video = rng.random(fine.video_shape)
+    dimmed = video * (rows / rows.max())[:, None] * columns / columns.max()
+    expected = DualArm(geometry, code, 1, 4, np.float64).forward(dimmed)[0]
+    np.testing.assert_allclose(fine.forward(video)[0], expected)
+    assert SHADED.swapped().shade_a == SHADED.shade_b
+
+
+def test_light_that_is_not_above_0_is_refused() -> None:
+    with pytest.raises(UsageError, match="light on the field is impossible"):
+        Blur((0.0, 0.0), (0.0, 0.0), (0.0, -1.0, 0.0, 0.0))
+
+
 def test_an_image_without_blur_is_unchanged() -> None:
     np.testing.assert_array_equal(blur_matrix(0.0, 12), np.eye(12))
     np.testing.assert_array_equal(blur_matrix(0.0, 12, 3), np.eye(4))

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -13,6 +15,7 @@ from acquire.errors import UsageError
 from acquire.forward import DualArm, Registration, hold_video, merge_video
 from acquire.forward.registration import sampling_matrix
 from acquire.geometry import Geometry
+from acquire.sim.effects.lens import LensDistortion
 
 ALIGNMENTS = [
     Alignment(0.3, -0.2),
@@ -20,6 +23,7 @@ ALIGNMENTS = [
     Alignment(1.5, -1.0, -8.0, 0.97),
     Alignment(40.0, 0.0),
 ]
+DISTORTED = Alignment(1.5, -1.0, 0.5, 1.01, 0.04)
 
 
 @pytest.mark.parametrize("alignment", ALIGNMENTS)
@@ -31,6 +35,26 @@ def test_it_interpolates_where_arm_b_looks(alignment: Alignment) -> None:
     expected = affine_transform(frame, back, offset, order=1, mode="nearest")
     seen = (sampling_matrix(alignment, n) @ frame.ravel()).reshape(n, n)
     np.testing.assert_allclose(seen, expected, atol=1e-12)
+
+
+@pytest.mark.parametrize("part", [0.06, -0.05])
+def test_a_distorted_image_is_that_of_the_lens(part: float) -> None:
+    """The effect ``lens_distortion`` and R show the same point, where both see the scene."""
+    n = 24
+    effect = LensDistortion(kind="lens_distortion", arm="b", part=part)
+    setting = SimpleNamespace(arm="b", scene=SimpleNamespace(size=n))
+    frame = np.random.default_rng(4).random((1, n, n)).astype(np.float32)
+    expected = effect.stages(setting)[0].run(frame)[0]  # type: ignore[arg-type,call-arg]
+    seen = (sampling_matrix(Alignment(distortion=part), n) @ frame[0].ravel()).reshape(n, n)
+    inner = slice(4, -4)
+    np.testing.assert_allclose(seen[inner, inner], expected[inner, inner], atol=1e-5)
+
+
+@pytest.mark.parametrize("part", [0.05, -0.06, 0.0])
+def test_positions_in_either_view_are_inverse(part: float) -> None:
+    alignment, half = Alignment(3.0, -2.0, 1.5, 1.02, part), 32.0
+    points = np.indices((9, 9)) * 7.0 - 28.0
+    np.testing.assert_allclose(alignment.to_a(alignment.to_b(points, half), half), points, atol=1e-6)
 
 
 def test_an_image_shifted_by_whole_pixels_is_that_image() -> None:
@@ -51,7 +75,7 @@ def test_a_quarter_turn_is_counter_clockwise() -> None:
 
 
 @pytest.mark.parametrize("merge", [1, 2, 3, 5])
-@pytest.mark.parametrize("alignment", ALIGNMENTS)
+@pytest.mark.parametrize("alignment", [*ALIGNMENTS, DISTORTED])
 def test_rows_sum_to_one_and_nothing_is_negative(alignment: Alignment, merge: int) -> None:
     matrix = sampling_matrix(alignment, 12, merge)
     np.testing.assert_allclose(matrix.sum(axis=1), 1, atol=1e-12)
