@@ -68,7 +68,8 @@ def check_suffix(path: Path) -> None:
             + (f"{path.suffix} is not a known format" if path.suffix else "its name has no suffix"),
             possible=".mp4 (a movie), .gif or .webp (an animation), .png (a sheet of stills), "
             ".html (a page with a player)",
-            hint=f"--out {path.with_suffix('.mp4')}",
+            # pathlib has no other suffix for a path without a name, such as "." and "/"
+            hint=f"--out {path.with_suffix('.mp4') if path.name else 'NAME.mp4'}",
         )
 
 

@@ -30,7 +30,8 @@ POSSIBLE = (
 def parse_code(text: str, *, repeats: bool = False) -> Code:
     """Parse a code; with ``repeats``, listed bits repeat. Raises UsageError that names the forms."""
     kind, _, rest = text.partition(":")
-    if kind == "prbs" and (found := re.fullmatch(r"(\d{1,2}):(0x[0-9a-fA-F]+|\d+)", rest)):
+    # A seed has at most 39 digits, and Python refuses to convert thousands.
+    if kind == "prbs" and (found := re.fullmatch(r"(\d{1,2}):(0x[0-9a-fA-F]+|\d{1,39})", rest)):
         degree, number = int(found[1]), found[2]
         if number.startswith("0x"):
             return PrbsCode(degree, int(number, 16))
