@@ -169,7 +169,9 @@ def note_json(facts: Any) -> None:
 
 def quantity(value: float, unit: str) -> str:
     """Format ``value`` with three significant digits and a metric prefix: 33.3 kHz, 1.2 MB."""
-    for factor, prefix in ((1e12, "T"), (1e9, "G"), (1e6, "M"), (1e3, "k")):
-        if abs(value) >= factor:
-            return f"{value / factor:.3g} {prefix}{unit}"
-    return f"{value:.3g} {unit}"
+    # Rounded first: 999.6 Hz are 1 kHz, and would be 1e+03 Hz otherwise.
+    rounded = float(f"{value:.3g}")
+    for factor, prefix in ((1e18, "E"), (1e15, "P"), (1e12, "T"), (1e9, "G"), (1e6, "M"), (1e3, "k")):
+        if abs(rounded) >= factor:
+            return f"{rounded / factor:.3g} {prefix}{unit}"
+    return f"{rounded:.3g} {unit}"
