@@ -50,7 +50,9 @@ def _bits(text: str) -> NDArray[np.uint8]:
         if path.suffix == ".npy":
             return _from_array(path)
         with refused(path, "read"):
+            # Twice the bits, which leaves room for white space between them.
             raw = read_regular(path, MOST_LISTED_BITS * 2)
+        # Other characters become ones that are no bits, and are refused below.
         text = "".join(raw.decode("ascii", "replace").split())
         if re.fullmatch("[01]+", text):
             return np.frombuffer(text.encode(), np.uint8) - ord("0")

@@ -39,6 +39,7 @@ SUBSTEP_TICKS = 1000
 """Ticks per sub-step of the clock if only the line rate is known."""
 MOST = 2**62
 """Limit of ticks, and of the time since line 0 (ns): with the time of line 0, 64 bits still suffice."""
+# `acquire info` shows the UTC of a clock that is so uncertain as unknown.
 UNKNOWN_NS = 2**62
 """Uncertainty of an unknown clock."""
 NO_ARM = "not_imported"
@@ -159,6 +160,7 @@ def _checked(arms: Mapping[str, Arm], instrument: Instrument, most_lines: int | 
             possible="the same number of lines in both arms",
             hint=f"--lines {min(counts.values())}, to take this number of each",
         )
+    # The same samples may come in either byte order.
     if len({source.file.dtype.newbyteorder("=") for source in arms.values()}) > 1:
         raise UsageError("the arms have different types", possible="uint8 or uint16 for both")
     for arm, source in arms.items():
@@ -217,6 +219,7 @@ def shifted(code: Code, start: int) -> Code:
         if count < 1:
             raise UsageError(f"--code-start {start} is beyond the {code.length} bits of the code")
         return ListedCode.of(code.bits(start, count), repeats=code.repeats)
+    # A constant code is the same from any bit on.
     return code
 
 
