@@ -59,10 +59,12 @@ def main() -> int:
         where = f"{error.filename}: " if error.filename else ""
         kind = DeviceError if error.errno in HOST_ERRORS else UsageError
         return _failed(kind(f"{where}{error.strerror or error}"))
+    # Without a message: `interrupts_handled` has acknowledged it.
     except KeyboardInterrupt:
         return EXIT_INTERRUPTED
 
 
 def _failed(error: AcquireError) -> int:
+    # By the words themselves: the error may be that they cannot be parsed.
     print_error(error, as_json=json_requested())
     return error.exit_code

@@ -19,6 +19,7 @@ from acquire.errors import UsageError
 if TYPE_CHECKING:
     from acquire.evaluate.paper.page import Drawn
 
+# As `FIGURES` of acquire.evaluate.paper, whose import loads numpy: help does without it.
 NAMES = ("fig6", "fig7", "fig8", "fig9", "fig10", "fig11")
 
 
@@ -90,12 +91,14 @@ def paper(
     # Threads of BLAS spin while they wait for cores that other programs use.
     with new_directory(out), activity_progress() as report, limit_blas(idle_cores()):
         for name in chosen:
+            # The name is bound here and now: the loop goes on to the next.
             studio = Studio(out, options, seed, lambda text, name=name: report(f"{name}: {text}"))  # type: ignore[misc]
             if recording is None:
                 figure = make(name, studio)
             else:
                 with mpl.rc_context(STYLE):
                     figure = figure_of(open_recording(recording), studio, first_line)
+            # Drawn at once, so that only one figure's videos are in memory.
             made.append(draw(figure, out, studio.host.busyness()))
             # After every figure, so that an interrupted run leaves a page with those it has made.
             page = write_page(

@@ -78,6 +78,7 @@ def render(
             raise UsageError(f"{name} {value} is out of range", possible=f"{low} to {high}")
     check_suffix(out)
     check_new_path(out)
+    # A URL has slashes on every system.
     panels = [Panel(PurePosixPath(place).stem, open_video(place)) for place in video]
     # The suffix stays, since it sets the format.
     part = out.with_name(f".{os.getpid()}.{out.name}")
@@ -88,6 +89,7 @@ def render(
         check_new_path(out)
         part.rename(out)
     finally:
+        # Only what was not finished: the rename leaves nothing behind.
         part.unlink(missing_ok=True)
     size = out.stat().st_size
     if json:

@@ -119,6 +119,7 @@ def tradeoff(
     from acquire.reconstruct.learned import remember
 
     kinds = tuple(parse_voxels(text) for text in voxels or ["3x1"])
+    # Of all solvers only those that can be imported: somebody's broken plug-in must not end a study.
     combinations = list(
         itertools.product(solver or SOLVERS.working(), preset or ("fast", "balanced"), dtype or ("float32",))
     )
@@ -236,6 +237,7 @@ def _opened(source: str, out: Path, lines: int) -> tuple[Recording, Study | None
     from acquire.simulate import bench_of, simulate, study
     from acquire.store import open_recording
 
+    # A recording is a directory or a URL, a scene a file or a name.
     if "://" in source or os.path.isdir(source):  # noqa: PTH112  # Path.is_dir raises for an impossible name
         recording = open_recording(source)
         return recording, None

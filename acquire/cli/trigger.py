@@ -134,6 +134,7 @@ def arm(
             tag_every_lines=rig.trigger.tag_every_lines,
         )
         if memory:
+            # A run states its code bit by bit: what is in the device is read back.
             run = replace(run, code=LoadedCode(driver.device().read_code(driver.device().code_length())))
         driver.prepare(run)
         fit = driver.start() if start else None
@@ -179,6 +180,7 @@ def selftest(
     with device_of(config, url, settings) as (driver, _):
         result = driver.device().self_test()
     failed = [name.removesuffix("_failed") for name, bit in result.items() if name != "done" and bit]
+    # A self-test that was not run has found nothing wrong, either.
     if failed or not result["done"]:
         raise TriggerError(f"the self-test failed: {', '.join(failed) or 'it was not run'}")
     if json:
