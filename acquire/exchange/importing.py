@@ -242,15 +242,6 @@ def _unknown(arms: Mapping[str, Arm], instrument: Instrument) -> list[str]:
     return found
 
 
-def _clock(instrument: Instrument) -> ClockFit:
-    """Return a clock whose tick 0 is placed so that the first line is read out at the given time."""
-    geometry = Geometry(instrument.stages, instrument.substeps, 1)
-    substep = instrument.substeps * instrument.first_line + geometry.readout_substep
-    relative = ClockFit(instrument.clock_hz, 0, UNKNOWN_NS)
-    first_ns = int(relative.time_ns(np.array([substep * instrument.substep_ticks], np.uint64))[0])
-    return ClockFit(instrument.clock_hz, (instrument.start_ns or 0) - first_ns, UNKNOWN_NS)
-
-
 def _spec(
     arms: Mapping[str, Arm], instrument: Instrument, run_id: str, unknown: tuple[str, ...], lines: int
 ) -> RecordingSpec:
@@ -262,6 +253,12 @@ def _spec(
         1 << max(4, lines.bit_length()),
     )
     usual = {"white_dn": float(np.iinfo(dtype).max), "black_level_dn": 0.0, "responsivity_dn": 1.0}
+    # Tick 0 of the clock is placed so that the first line is read out at the given time.
+    geometry = Geometry(instrument.stages, instrument.substeps, 1)
+    substep = instrument.substeps * instrument.first_line + geometry.readout_substep
+    relative = ClockFit(instrument.clock_hz, 0, UNKNOWN_NS)
+    first_ns = int(relative.time_ns(np.array([substep * instrument.substep_ticks], np.uint64))[0])
+    clock = ClockFit(instrument.clock_hz, (instrument.start_ns or 0) - first_ns, UNKNOWN_NS)
     return RecordingSpec(
         run_id=run_id,
         stages=instrument.stages,
@@ -269,7 +266,7 @@ def _spec(
         pixels=file.pixels,
         dtype=dtype.name,
         first_line=instrument.first_line,
-        clock=_clock(instrument),
+        clock=clock,
         code=shifted(instrument.code, instrument.code_start).to_attrs(),
         substep_ticks=instrument.substep_ticks,
         trigger={"model": "none: the lines are imported"},
