@@ -45,10 +45,12 @@ class Latencies:
 
     def close(self) -> None:
         """Release the memory. Idempotent."""
+        # First: memory of which a view is left cannot be unmapped (BufferError).
         self._words.release()
         self._memory.close()
 
     def __reduce__(self) -> tuple[Any, ...]:
+        # It is pickled with its opener for the grabber's process, which maps the same memory.
         return Latencies, (self._memory,)
 
 

@@ -97,6 +97,7 @@ def measure_parts(load: Load, directory: Path) -> Parts:
         ring=_pace_of_ring(load, blocks),
         codec=_pace(pack),
         recorder=_pace_of_recorder(load, blocks, directory),
+        # taskset or a container may leave fewer than the host has.
         cores=len(os.sched_getaffinity(0)),
     )
 

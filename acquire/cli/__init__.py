@@ -64,6 +64,7 @@ def _carry_out() -> int:
         where = error.filename or ("standard output" if full else "")
         kind = DeviceError if error.errno in HOST_ERRORS else UsageError
         return _failed(kind(f"{where}: {error.strerror or error}".removeprefix(": ")))
+    # Without a message: `interrupts_handled` has acknowledged it.
     except KeyboardInterrupt:
         return EXIT_INTERRUPTED
 
@@ -94,5 +95,6 @@ def _is_full(stream: TextIO) -> bool:
 
 
 def _failed(error: AcquireError) -> int:
+    # By the words themselves: the error may be that they cannot be parsed.
     print_error(error, as_json=json_requested())
     return error.exit_code

@@ -124,6 +124,7 @@ class _TrialReporter:
         self._advance(self._done, self._runs)
         if self._aloud:
             result = "sustained" if trial.held else "not sustained"
+            # On stderr: on stdout the trials are a table, in another order.
             say(f"  {quantity(trial.line_rate_hz, 'Hz')}: {result}", err=True)
 
 

@@ -274,6 +274,7 @@ def show(
     else:
         print_facts(known_facts(known))
     if out is not None:
+        # Imported only for a page: matplotlib takes longer than everything else here.
         from acquire.cli.places import new_directory
         from acquire.evaluate.calibration_page import write_page
 
@@ -318,6 +319,7 @@ def check(
         for doubt in found.doubts:
             print_warning(doubt)
     if not found.holds:
+        # Without a message: the table, or the JSON, says what has changed.
         raise typer.Exit(CHANGED)
 
 
@@ -361,6 +363,7 @@ def _keep(place: str, found: Finding, *, json: bool, new: bool = False) -> None:
     """Add a finding to the calibration at a place, and print it."""
     from acquire.calibrate import Calibration, save_calibration
 
+    # Only steps that need no earlier one may begin a calibration.
     known = Calibration(found.instrument) if new and not _exists(place) else _known(place)
     # Shown all the same: the figures say by how little the views differ. Saved, it would count as known.
     if found.step == "orientation" and found.orientation is None:

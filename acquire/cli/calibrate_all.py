@@ -123,6 +123,7 @@ def _step(
             # Without anybody to correct the cause, the next attempt would fail in the same way.
             if not (ask and left):
                 raise
+            # The error is the advice on what to correct before Enter is pressed again.
             print_warning(f"{step.name}: {error}")
             note("repeating this step:")
             continue

@@ -62,6 +62,7 @@ def delay(
     from acquire.calibrate.exposure import open_exposure
 
     if recordings:
+        # Whole, whatever it lacks: these recordings are what the user wants to be evaluated.
         exposures, whole = [open_exposure(each) for each in recordings], True
     else:
         exposures, whole = _swept(directory, lines, socket, ask=not yes)
@@ -127,4 +128,5 @@ def _found(out: str, exposures: list[Exposure], *, whole: bool) -> Finding:
                 f"{known.uncertainty.max():.2g} in {out}",
                 hint="the whole sweep; the earlier result is kept",
             )
+    # Evaluated already, since its uncertainty decided whether it is saved.
     return save_finding(out, exposures[0], lambda _: found)

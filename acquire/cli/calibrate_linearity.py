@@ -89,6 +89,7 @@ def _ramp(out: str, directory: Path, lines: int, socket: Path | None, *, ask: bo
     from acquire.cli.progress import Progress
     from acquire.daemon.messages import TriggerWindow
 
+    # Before the recordings, not after: without a dark they could not be evaluated.
     offset = offset_of(open_calibration(out), "linearity")
     note(f"linearity: {LINEARITY.prepare}")
     if ask:

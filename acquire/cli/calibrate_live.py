@@ -47,6 +47,7 @@ def instrument(socket: Path | None, directory: Path) -> Iterator[Client]:
             raise StateError(
                 f"the daemon is {status.state}", possible="idle or armed", hint="acquire stop, or disarm"
             )
+        # Only now, so that a daemon in another state leaves no empty directory.
         directory.mkdir(parents=True, exist_ok=True)
         calm_s = CALM_S
         try:
@@ -80,6 +81,8 @@ def record(
         # Light and delays can be given only when arming.
         if daemon.status().state == "armed":
             daemon.disarm()
+        # Without a calibration: the rig may name the very one that is being made, and that does not exist
+        # yet.
         daemon.arm(code=code, calibration="none", delays=delays, window=window)
         path = free_path(directory, name)
         status = daemon.start(path, lines=lines)
@@ -105,6 +108,7 @@ def record(
 def free_path(directory: Path, name: str) -> Path:
     """Return the first path ``NAME-<number>.zarr`` that does not exist: earlier recordings are kept."""
     number = 1
+    # The daemon has a working directory of its own.
     while (path := directory.absolute() / f"{name}-{number}.zarr").exists():
         number += 1
     return path
@@ -176,4 +180,5 @@ def _leave(daemon: Client, directory: Path, *, armed: bool) -> None:
     if status.state == "armed":
         daemon.disarm()
     if armed:
+        # With the rig's own light, delays and calibration, which a step replaces.
         daemon.arm()

@@ -52,6 +52,7 @@ def features(serial: SerialArgument, config: ConfigOption = None, json: JsonFlag
     from acquire.camera.visit import visit
 
     with Bench(config) as bench:
+        # In a process of its own, which can be ended if the camera's driver hangs.
         rows = visit(bench.opener(serial), feature_table, timeout_s=OPEN_S)
     if json:
         print_json(rows)
@@ -100,8 +101,10 @@ def snapshot(
         if path.suffix.lower() == ".npy":
             np.save(file, pixels)
         else:
+            # A picture of a single value has no span to be divided by.
             low, span = int(pixels.min()), max(1, int(pixels.max()) - int(pixels.min()))
             stretched = np.rint((pixels.astype(np.float32) - low) * (255 / span)).astype(np.uint8)
+            # An open file has no suffix from which Pillow could take the format.
             Image.fromarray(stretched).save(file, "PNG")
     facts = {
         "picture": str(path),

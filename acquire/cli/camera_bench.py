@@ -82,6 +82,7 @@ class Bench:
         return self
 
     def __exit__(self, *_: object) -> None:
+        # The thread first: it reads from the trigger that is closed below.
         self._ending.set()
         # A thread that was never started cannot be joined.
         if self._listener.ident is not None:

@@ -74,6 +74,7 @@ def live(
     if code is not None and code not in get_args(LightCode):
         raise UsageError(f"there is no light {code!r} for --code", possible=", ".join(get_args(LightCode)))
     with (
+        # Before the cameras are opened, which takes seconds: a Ctrl-C meanwhile closes them, too.
         stop_on_interrupt("closing the cameras") as stop_requested,
         open_source(config, serial, code, Client(socket)) as source,  # type: ignore[arg-type]  # checked above
     ):
@@ -86,6 +87,7 @@ def live(
             from acquire.cli.camera_screen import Screen
 
             screen = Screen(source.names, source.where, TURN_S)
+            # rich would otherwise redraw the same readings four times a second.
             with Live(screen, console=Console(), auto_refresh=False) as display:
                 for _, latest in readings:
                     screen.show(latest)

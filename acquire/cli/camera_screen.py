@@ -63,6 +63,7 @@ class Screen:
         reading = self._readings.get(name)
         lines_hz = reading.lines / self._turn_s if reading else 0.0
         title = Text(name if name == "camera" else f"camera {name}", style="bold")
+        # A rig file, perhaps somebody else's, may have anything in this place.
         grid.add_row(title, Text(visible(serial)), quantity(lines_hz, "Hz"), "lines")
         if reading is None or reading.level is None or reading.brightest is None:
             return grid

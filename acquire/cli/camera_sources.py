@@ -78,6 +78,7 @@ class CameraSource:
             for camera in self._cameras:
                 while camera.take(0.0):
                     pass  # discard readings from before the first line
+        # `with` does not call `__exit__` if `__enter__` raises.
         except BaseException:
             self._end.close()
             raise
@@ -177,6 +178,8 @@ def open_source(config: str | None, serial: str | None, code: LightCode | None, 
             raise NoDaemonError(
                 error.message, hint="acquire serve, or --config RIG to open the cameras"
             ) from error
+        # Without a rig, the cameras are those of the environment's producers, which only a serial number
+        # tells apart.
         return CameraSource(Bench(None), serial)
     if code is not None:
         raise UsageError(

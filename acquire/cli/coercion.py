@@ -35,6 +35,7 @@ class Quick:
         several = param.multiple or param.nargs == -1
         if value is None and not several:
             return None
+        # click has made a bool of a flag already.
         if isinstance(value, bool) and self._type is bool:
             return value
         # What needs more than a conversion is left to typer: its validator takes long to build, but is right.

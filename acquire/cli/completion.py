@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterable
 
 _PLAIN_NAME = re.compile(r"[\w.@+=,~-]+")
+# Not taken from the daemon's module, which would be imported for every Tab.
 STATES = ("idle", "armed", "recording", "draining", "faulted", "sealed")
 
 
@@ -56,6 +57,7 @@ def words_so_far() -> list[str]:
         return words[1 : int(os.environ.get("COMP_CWORD", len(words)))]
     typed = os.environ.get("_TYPER_COMPLETE_ARGS", "")
     words = typed.split()[1:]
+    # After a space the word being typed is a new one, of which nothing is there yet.
     return words if typed.endswith(" ") else words[:-1]
 
 
@@ -125,6 +127,7 @@ def _built_in(incomplete: str, kind: str) -> list[str]:
 def _paths(incomplete: str, suffixes: Iterable[str]) -> list[str]:
     """Complete paths with one of the suffixes, and other directories, which may contain some."""
     parent, _, begun = incomplete.rpartition("/")
+    # Before the only slash of "/x" there is as little as before a name without one.
     base = Path(f"{parent}/" if incomplete.startswith("/") or parent else ".")
     found = []
     # Nothing to offer is better than a traceback in the middle of a command line.

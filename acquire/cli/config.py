@@ -200,4 +200,5 @@ def dotted(table: dict[str, Any], prefix: str = "") -> Iterator[str]:
             yield from dotted(value, f"{prefix}{key}.")
         # TOML has no null.
         elif value is not None:
+            # Unprintable characters are \uXXXX in both.
             yield f"{prefix}{key} = {json_text(value)}"

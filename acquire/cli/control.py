@@ -23,6 +23,7 @@ SocketOption = Annotated[
 ]
 SEALED_WORD = "sealed"
 """Argument of ``status --wait``: any state in which no recording is in progress."""
+# None: it was not sealed.
 DAMAGED = ("INCOMPLETE", "ABORTED", None)
 """Conditions of a recording that lost lines."""
 
@@ -220,6 +221,7 @@ def status(
     Example: [bold]acquire status --wait sealed --timeout 30s[/], or [bold]acquire status --watch[/]
     """
     if wait is not None:
+        # Not for every status: one without options is to come at once.
         from acquire.daemon.states import SEALED, State
 
         waits = {SEALED_WORD: SEALED, **{str(state): frozenset({state}) for state in State}}

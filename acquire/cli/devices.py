@@ -45,6 +45,7 @@ def devices(
 
     Example: [bold]acquire devices --config rig-demo[/]
     """
+    # All of them first: the columns are as wide as their longest cells.
     rows = list(of_rig(config) if config else _of_host())
     if json:
         print_json(rows)

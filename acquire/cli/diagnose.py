@@ -72,6 +72,7 @@ def diagnose(
     else:
         _print(found, first, count, whose)
     if found.wrong:
+        # Without a message: the verdict has been printed.
         raise typer.Exit(WRONG)
 
 
@@ -87,6 +88,7 @@ def _print(found: Diagnosis, first: int, count: int, whose: dict[str, str]) -> N
     say()
     rows = [
         (
+            # 0: the recording's own description, with which the others are compared.
             f"{row.likelier:+.0f}" if row.likelier else "0",
             f"{row.errors:+.1f}" if row.likelier else "",
             f"{row.agreement:.1f}" if row.agreement else "",

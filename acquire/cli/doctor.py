@@ -18,6 +18,7 @@ if TYPE_CHECKING:
 
     from acquire.daemon.doctor import Finding
 
+# In capitals, since these tables have no colours.
 WORDS = {"good": "good", "warning": "WARNING", "bad": "BAD"}
 
 
@@ -63,6 +64,7 @@ def doctor(
         print_json([asdict(one) for one in findings])
     else:
         print_table(("check", "", "result"), [(one.name, WORDS[one.level], one.text) for one in findings])
+        # Below the table, which long advice would make too wide for a terminal.
         for one in findings:
             if one.level != "good" and one.todo:
                 say(f"{one.name}: {one.todo}")

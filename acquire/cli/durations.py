@@ -40,6 +40,7 @@ def duration_ns(text: str) -> float | None:
         return None
     try:
         value = float(found[1]) * UNITS_NS[found[2]]
+    # Such as 1.2.3, which has only characters of a number.
     except ValueError:
         return None
     # `1e999` is a valid float, and infinite.
@@ -58,6 +59,7 @@ def parse_duration_ns(text: str) -> int:
 
 def seconds(text: str | float) -> float:
     """Parse a duration to seconds. Raises typer.BadParameter that names the possible forms."""
+    # As text: typer gives the default to the parser as well, and that is a number.
     value = duration_ns(str(text))
     if value is None:
         raise typer.BadParameter(f"{text!r} is not a duration, such as {DURATIONS}")

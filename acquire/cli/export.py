@@ -89,7 +89,9 @@ def export(
     # Refused before the source is opened, which may be far away.
     format_for(out)
     check_new_path(out)
+    # None is no format of ours: `open_recording` then says what is there instead.
     if (format_of(source) or "").startswith("acquire-video/"):
+        # 1, the default, averages nothing and is no mistake with a video.
         averaged = average if average > 1 else None
         _refuse_numbers("video", "--first-frame and --frames", first_line, lines, averaged)
         video = open_video(source)
@@ -148,6 +150,7 @@ def _frames_between(
         raise UsageError(
             "numbers and times exclude each other", possible="--first-frame and --frames, or --from and --to"
         )
+    # A video without frames is refused below, whatever the times.
     first_ns, interval_ns = int(video.time_ns[0]) if total else 0, video.interval_ns
     low, high = (after_ns(text, lambda: first_ns) for text in (begin, end))
     start = 0 if low is None else math.ceil(low / interval_ns - ROUNDING)

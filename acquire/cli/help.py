@@ -60,9 +60,11 @@ def make_plain(command: Any) -> None:
     command.rich_markup_mode = None
     command.context_settings["max_content_width"] = columns()
     for name in ("help", "short_help", "epilog"):
+        # The help texts have marks for rich, which does not print them here.
         text = getattr(command, name)
         setattr(command, name, text and _MARKUP.sub("", text))
     if command.help and not command.short_help:
+        # Without a summary click takes the help's beginning, cut to a line of the list.
         command.short_help = command.help.partition("\n\n")[0].replace("\n", " ")
     for below in getattr(command, "commands", {}).values():
         make_plain(below)

@@ -239,6 +239,7 @@ def _arms(
     file = held.enter_context(open_lines(files[0], replace(layout, columns=columns[arm])))
     if single is not None and file.arms == 2:
         raise UsageError(f"--arm {arm}: {file.path} has two arms", possible="--arm with a file of one arm")
+    # A file of both arms has them in this order, as our own exports do.
     return {arm: Arm(file)} if file.arms == 1 else {"a": Arm(file, 0), "b": Arm(file, 1)}
 
 
@@ -299,6 +300,7 @@ def _of_options(
 
 
 def _check_sizes(stages: int, substeps: int, line_rate_hz: float) -> None:
+    # The limits of a rig file, where there is one (`GeometryConfig`).
     for name, value, low, high in (
         ("--stages", stages, 1, 4096),
         ("--substeps", substeps, 1, 8),
@@ -322,6 +324,7 @@ def _of_rig(name: str) -> Instrument:
         substep_ticks=rig.trigger.substep_ticks,
         cameras={arm: {key: getattr(rig.cameras.arm(arm), key) for key in keys} for arm in ("a", "b")},
         config=rig.model_dump(mode="json"),
+        # Also for a rig of layout compact: --columns-a and --columns-b cut its arms out of the lines.
         layout="dual" if rig.laid_out is None else "fibre",
         fibre=rig.laid_out,
     )

@@ -63,12 +63,14 @@ def install_service(
         files[rules] = UDEV
     if not (install or directory):
         for path, text in files.items():
+            # As a comment, so that what is printed can be saved as the file.
             say(f"# {path}")
             for line in text.splitlines():
                 say(line)
         return
     # check all files before the first is written
     for path, text in files.items():
+        # A file of somebody else's may be no UTF-8, and differs then in any case.
         if path.exists() and path.read_text(encoding="utf-8", errors="replace") != text:
             raise UsageError(
                 f"{path} exists with different contents and is not overwritten",
@@ -81,5 +83,6 @@ def install_service(
         say(f"wrote {path}")
     flag = " --user" if user else ""
     say(f"next: systemctl{flag} daemon-reload && systemctl{flag} enable --now acquire")
+    # The unit's daemon has no XDG_RUNTIME_DIR: it listens in /run, where a user's client does not look.
     if not user and rig.control.socket == default_socket():
         say(f"for clients: export ACQUIRE_SOCKET={SOCKET}")

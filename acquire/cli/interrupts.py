@@ -142,7 +142,9 @@ def _end_now() -> None:
     processes = sys.modules.get("multiprocessing")  # it is loaded if any child was started
     for child in processes.active_children() if processes else ():
         child.kill()
+    # os._exit, since sys.exit would end the timer's own thread only.
     timer = threading.Timer(GRACE_S, os._exit, (EXIT_INTERRUPTED,))
+    # A daemon thread: for any other the interpreter would wait at its end.
     timer.name, timer.daemon = END_NOW, True
     timer.start()
     raise KeyboardInterrupt

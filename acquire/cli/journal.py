@@ -27,6 +27,7 @@ class Journal:
     @contextmanager
     def stage(self, name: str) -> Iterator[dict[str, str]]:
         """Time a step. The caller may set ``detail`` in the dictionary that it gets."""
+        # Only now: it imports NumPy and SciPy, which a run that is refused does without.
         from acquire.evaluate.report import Stage
 
         note: dict[str, str] = {}
@@ -34,6 +35,7 @@ class Journal:
         with stage_progress(name):
             yield note
         seconds = time.perf_counter() - started
+        # A step that fails does not come here: its command ends with an error and without a report.
         self.stages.append(Stage(name, seconds, note.get("detail", "")))
         detail = f"  {note['detail']}" if "detail" in note else ""
         say(f"{name:<34} {seconds:6.1f} s{detail}", err=True)

@@ -38,6 +38,7 @@ def say(text: str = "", *, err: bool = False) -> None:
 
 def print_json(value: Any) -> None:
     """Print one JSON document; values of other types are written as text."""
+    # Not by `say`, which would escape the line breaks of the document.
     typer.echo(json_text(value, indent=2))
 
 
@@ -117,8 +118,10 @@ def table_lines(columns: Iterable[str], rows: Iterable[Iterable[Any]]) -> list[s
     widths = [max(map(len, column)) for column in zip(titles, *cells, strict=True)]
     # A row that the terminal breaks can be read by nobody.
     if sum(widths) + 2 * (len(widths) - 1) > line_width():
+        # Without the empty cells, each of which would take a line of its own here.
         blocks = [fact_lines({t: cell for t, cell in zip(titles, row, strict=True) if cell}) for row in cells]
         return [line for block in blocks for line in ("", *block)][1:]
+    # By their first characters, since numbers have units.
     right = [bool(cells) and all(row[i][:1].isdigit() for row in cells) for i in range(len(titles))]
     return [
         "  ".join(
@@ -140,6 +143,7 @@ def print_error(error: AcquireError, *, as_json: bool) -> None:
         # `kind`, since the object itself is called error.
         facts = error.to_dict()
         about = {"kind": facts.pop("error"), **facts}
+        # As a whole, so that a program finds one document on stderr.
         note_json({"error": about})
         return
     first, *others = error.message.split("\n")
@@ -169,7 +173,9 @@ def note_json(facts: Any) -> None:
 
 def quantity(value: float, unit: str) -> str:
     """Format ``value`` with three significant digits and a metric prefix: 33.3 kHz, 1.2 MB."""
-    for factor, prefix in ((1e12, "T"), (1e9, "G"), (1e6, "M"), (1e3, "k")):
-        if abs(value) >= factor:
-            return f"{value / factor:.3g} {prefix}{unit}"
-    return f"{value:.3g} {unit}"
+    # Rounded first: 999.6 Hz are 1 kHz, and would be 1e+03 Hz otherwise.
+    rounded = float(f"{value:.3g}")
+    for factor, prefix in ((1e18, "E"), (1e15, "P"), (1e12, "T"), (1e9, "G"), (1e6, "M"), (1e3, "k")):
+        if abs(rounded) >= factor:
+            return f"{rounded / factor:.3g} {prefix}{unit}"
+    return f"{rounded:.3g} {unit}"

@@ -19,6 +19,7 @@ from acquire.errors import UsageError
 if TYPE_CHECKING:
     from acquire.evaluate.paper.page import Drawn
 
+# As `FIGURES` of acquire.evaluate.paper, whose import loads numpy: help does without it.
 NAMES = ("fig6", "fig7", "fig8", "fig9", "fig10", "fig11")
 
 
@@ -75,6 +76,12 @@ def paper(
         if figures not in (None, [], ["fig9"]):
             raise UsageError(f"{', '.join(figures)} cannot be made from a recording", possible="fig9")
         chosen = ["fig9"]
+    elif first_line is not None:
+        raise UsageError(
+            "--first-line has no effect without --recording", possible="both, or neither of them"
+        )
+    if budget is not None and not budget > 0:
+        raise UsageError(f"a budget of {budget:g} s is out of range", possible="more than 0")
     import matplotlib as mpl
 
     from acquire.cores import idle_cores, limit_blas
@@ -82,20 +89,25 @@ def paper(
     from acquire.evaluate.paper.fig9_recorded import figure_of
     from acquire.evaluate.paper.page import draw, write_page
     from acquire.evaluate.themed import STYLE
+    from acquire.recon.solver import preset_iterations
     from acquire.reconstruct import Options
     from acquire.store import open_recording
 
-    options = Options(preset, solver, None, budget)  # type: ignore[arg-type]  # checked when it is used
+    # Raises for an unknown name, before a scene is recorded for it.
+    preset_iterations(solver, preset)
+    options = Options(preset, solver, None, budget)  # type: ignore[arg-type]  # checked above
     made: list[Drawn] = []
     # Threads of BLAS spin while they wait for cores that other programs use.
     with new_directory(out), activity_progress() as report, limit_blas(idle_cores()):
         for name in chosen:
+            # The name is bound here and now: the loop goes on to the next.
             studio = Studio(out, options, seed, lambda text, name=name: report(f"{name}: {text}"))  # type: ignore[misc]
             if recording is None:
                 figure = make(name, studio)
             else:
                 with mpl.rc_context(STYLE):
                     figure = figure_of(open_recording(recording), studio, first_line)
+            # Drawn at once, so that only one figure's videos are in memory.
             made.append(draw(figure, out, studio.host.busyness()))
             # After every figure, so that an interrupted run leaves a page with those it has made.
             page = write_page(

@@ -28,6 +28,7 @@ def local_path(text: str) -> Path:
             possible="a path on this machine",
             hint="the recording where it was made; info, verify, cut, reconstruct and replay accept URLs",
         )
+    # A file URL is a path on this machine, and other programs hand these out.
     return Path(text.removeprefix("file://"))
 
 

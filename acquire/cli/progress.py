@@ -62,6 +62,7 @@ class Progress:
     def doing(self, what: str) -> None:
         """Change the description of the work. The amount is unknown from now on."""
         with self._lock:
+            # The rate of what was done before says nothing of this.
             self._what, self._done, self._total, self._first = what, 0.0, 0.0, None
         if self._bar is not None:
             self._bar.update(0, description=what, completed=0, total=None, amount="")

@@ -192,6 +192,7 @@ def reconstruct(
     # Everything that can be wrong is checked before the solver runs.
     _check_options(search, (workers, dask), anything_wanted=bool(out or auto or explain))
     solver_options = parse_settings(settings or ())
+    # Built here to be checked, and once more by every process that solves.
     open_solver(solver, solver_options)
     if denoiser is not None:
         open_denoiser(denoiser)
@@ -318,6 +319,7 @@ def _make(
             # is added.
             elapsed_s = time.monotonic() - began
             share_s = (options.budget_s - elapsed_s) / (len(places) - len(outcomes))
+            # More than 0, as a budget has to be, even if the videos before have taken all of it.
             options = replace(options, budget_s=max(elapsed_s + share_s, LEAST_S))
         tasks, (workers, cluster) = len(request.stretches) * max(1, len(request.tiles)), where
         if workers is None and options.device != "cpu":
@@ -325,6 +327,7 @@ def _make(
         name = f"reconstructing {PurePosixPath(place).name}"
         with (
             stop_on_interrupt("finishing the current sub-segments with their results so far") as stopped,
+            # No advice beside a budget: 20 s were once announced as 25 minutes.
             stage_progress(name, QUICKER if options.budget_s is None else "") as advance,
         ):
             watcher = Watcher(tasks, advance, stopped.is_set)

@@ -44,6 +44,7 @@ def explain_calibration(
         found = explain(segment, chosen.calibration, voxels.spatial_merge, voxels.temporal_merge, advance)
     tile_facts = {} if tile is None else {"tile": str(tile)}
     facts = {"calibration": chosen.origin, **tile_facts, "parts": [asdict(worth) for worth in found]}
+    # Returned and not printed: with a video, both are in one document.
     if json:
         return facts
     which = f"{count} lines from line {segment.first_line}" + ("" if tile is None else f" of tile {tile}")

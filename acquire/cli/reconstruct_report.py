@@ -44,6 +44,7 @@ def print_outcomes(outcomes: list[Outcome], *, json: bool, preview: bool, more: 
         if preview:
             continue
         segments = outcome.provenance["segments"]
+        # Of a single one the facts above have said everything.
         if len(segments) > 1:
             say()
             rows = [
@@ -93,6 +94,7 @@ def _outcome_facts(outcome: Outcome) -> dict[str, Any]:
     iterated = f"{iterations} of {of_iterations}" if iterations < of_iterations else str(iterations)
     noise = None
     if quality.get("noise") is not None:
+        # What is not known is None in the provenance, which is JSON, and NaN in `Quality`.
         known = {key: float("nan") if value is None else value for key, value in quality.items()}
         noise = f"{quality['noise']:.2%} from the cameras: the lines are {Quality(**known).standing}"
     prediction = quality["prediction"]
@@ -119,6 +121,7 @@ def _tile_range(facts: dict[str, Any]) -> str | None:
     """Tiles of a scene behind a fibre, and how many of them are finished."""
     if not (tiles := facts["tiles"]):
         return None
+    # Every tile has all sub-segments that were asked for.
     finished = len(facts["segments"]) * len(tiles) // facts["segments_asked"]
     which = tiles[0] if len(tiles) == 1 else f"{tiles[0]} to {tiles[-1]}"
     return f"{which}, {finished} of {len(tiles)}"

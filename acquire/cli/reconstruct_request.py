@@ -162,6 +162,7 @@ def _requests(recording: Recording, arguments: Arguments) -> Prepared:
             arguments.options,
             iterations=PREVIEW_ITERATIONS,
             bandwidth=PREVIEW_BANDWIDTH,
+            # Voxels so large never explain the lines, so that there is nothing to find out.
             check=False,
             error=False,
         )
@@ -245,6 +246,7 @@ def _preview(selection: Selection, tiles: int, *, whole: bool | None) -> VideoRe
     glimpses = max(1, GLIMPSES // max(1, tiles))
     if lines > PREVIEW_LINES and end - begin >= glimpses * GLIMPSE_MERGE:
         return in_glimpses(selection, Voxels(side, GLIMPSE_MERGE), glimpses)
+    # In one piece, however long: its voxels are too coarse to need sub-segments.
     return in_voxels(selection, Voxels(side, PREVIEW_MERGE), whole_ends=whole, longest=1 << 62)
 
 
@@ -263,6 +265,7 @@ def _plan(recording: Recording, selection: Selection, arguments: Arguments) -> R
             )
     if arguments.plan is not None:
         plan = load_plan(arguments.plan)
+        # --ends goes before what the file says.
         return plan if arguments.ends is None else plan.model_copy(update={"ends": arguments.ends})
     if not arguments.segments:
         return None

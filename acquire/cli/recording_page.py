@@ -30,6 +30,7 @@ def list_row(facts: dict[str, Any]) -> tuple[str, ...]:
     name = Path(facts["path"]).name
     if "error" in facts:
         # One line of limited length, because an error may quote what is on the disk.
+        # The row begins with the name already.
         why = " ".join(facts["error"].removeprefix(facts["path"]).lstrip(": ").split())
         why = why if len(why) <= CELL_CHARACTERS else why[: CELL_CHARACTERS - 1] + "…"
         return (name, "-", "-", "-", why, "-")
@@ -85,6 +86,7 @@ def recording_facts(facts: dict[str, Any]) -> dict[str, Any]:
         "geometry": f"M = {sizes['stages']}, S = {sizes['substeps']}, {sizes['pixels']} pixels",
         "scene": _behind_fibre(sizes),
         "samples": facts["dtype"],
+        # Listed bits may be a megabyte of digits.
         "code": ", ".join(f"{key} {shortened(value, 60)}" for key, value in facts["code"].items()),
         "clock": f"{facts['clock']['clock_hz']} Hz, {utc}",
         "size": quantity(facts["bytes"], "B"),

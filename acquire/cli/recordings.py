@@ -120,6 +120,7 @@ def verify(recording: PlaceArgument, json: JsonFlag = False) -> None:
         verdict = "intact" if found.intact else "DAMAGED"
         size = quantity(found.bytes, "B")
         say(f"{found.path}: {verdict}; {found.state}, {found.lines} lines, {size}")
+        # Lists end after `LISTED` items: a recording on a failing disk may have thousands.
         _print_list("not intact on disk", map(str, found.damage))
         _print_list("contradictions", found.contradictions)
         _print_list("note", found.notes)
@@ -264,6 +265,7 @@ def cut(
     check_new_path(out)
     opened = open_recording(recording)
     first, count = lines_between(opened, first_line, lines, begin, end)
+    # Retention may have dropped the first lines of an endless recording.
     first = opened.first_available_line if first is None else first
     count = opened.first_line + opened.lines - first if count is None else count
     with stage_progress(f"cutting {count} lines"):
@@ -339,6 +341,7 @@ def _save(segment: Segment, out: Path) -> int:
     from acquire.store.delivery import whole_file
     from acquire.store.refusals import refused
 
+    # As an open file: NumPy would add .npz to the name of the unfinished one.
     with whole_file(out) as part, refused(out, "written"), part.open("wb") as file:
         np.savez(
             file,

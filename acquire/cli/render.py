@@ -79,6 +79,7 @@ def render(
             raise UsageError(f"{name} {value} is out of range", possible=f"{low} to {high}")
     check_suffix(out)
     check_new_path(out)
+    # A URL has slashes on every system.
     panels = [Panel(PurePosixPath(place).stem, open_video(place)) for place in video]
     with (
         stage_progress(f"rendering {out.name}") as advance,

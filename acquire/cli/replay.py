@@ -205,6 +205,7 @@ def _record(stored: Recording, out: Path, speed: float) -> str | None:
         status = follow(client, stored.lines, advance)
     if status.fault:
         return status.fault
+    # It may have ended early without a fault, as a disk that is too slow makes it end.
     last = status.last
     if last is None or last.lines < stored.lines:
         return (
@@ -214,6 +215,7 @@ def _record(stored: Recording, out: Path, speed: float) -> str | None:
         )
     again, dropped = open_recording(out), sum(map(len, stored.dropped_rows()))
     for arm in again.arms:  # are more lines missing than in the original?
+        # What retention has dropped is missing in the copy, too, and was not lost on the way.
         if sum(map(len, again.lost_rows(arm))) > sum(map(len, stored.lost_rows(arm))) + dropped:
             return "the rings were full"
     return None

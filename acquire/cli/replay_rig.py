@@ -60,6 +60,7 @@ def replay_rig(stored: Recording, speed: float, directory: Path, **simulation: A
         "trigger": {
             "clock_hz": stored.clock.clock_hz,
             "substep_ticks": stored.attrs["trigger"]["line_period_ticks"] // substeps,
+            # A rig file allows at most a third of the ring.
             "tag_every_lines": max(1, min(256, slots * block // 4)),
         },
         "cameras": {arm: _camera(stored, arm) for arm in ARMS},
@@ -97,6 +98,7 @@ def _camera(stored: Recording, arm: str) -> dict[str, Any]:
     """Return a camera for the recorded samples, with the smallest pixel format that holds their white."""
     facts = stored.attrs["cameras"][arm]
     wide = stored.camera(arm).dtype.itemsize > 1
+    # Formats of up to 8 bits take one byte for a sample, all others two.
     bits = {name: count for name, count in PIXEL_BITS.items() if (count > 8) == wide}
     fitting = [name for name, count in bits.items() if 2**count > facts["white_dn"]]
     if not fitting:

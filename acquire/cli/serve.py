@@ -80,6 +80,7 @@ def serve(
     rig = read()
     check_upload(rig)
     write_log(rig.service.level)
+    # uvicorn would log every request.
     logging.getLogger("uvicorn").setLevel(logging.WARNING)
     if owned:
         # A daemon thread, since it is blocked until the owner ends: nothing could join it.

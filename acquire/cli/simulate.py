@@ -81,6 +81,7 @@ def simulate(
         )
     limit_blas(1)  # both arms compute at the same time
     shown = load_scene(scene)
+    # With the scene, for a rig file that names none: it was refused although a scene had been given.
     rig = load_rig(config or shown.rig, parse_settings(settings or []), scene)
     count = shown.lines if lines is None else lines
     if duration is not None:
@@ -88,6 +89,7 @@ def simulate(
             raise UsageError("--lines and --duration exclude each other", possible="one of them")
         if not duration > 0:
             raise UsageError(f"--duration {duration} is out of range", possible="more than 0")
+        # Rounded down to 0, a duration below half a line would record nothing.
         count = max(1, round(duration * rig.line_rate_hz))
     facts: dict[str, Any] = {}
     if out is not None and not explain:

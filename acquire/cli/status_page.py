@@ -74,6 +74,7 @@ def status_line(status: Facts) -> str:
     """Return the status as one line, for `--watch` in a pipe."""
     arms = status["arms"]
     lost = sum(sum(arm["lost"].values()) for arm in arms.values())
+    # Of the fuller one, which is the first to have no room.
     full = max((arm["ring"]["fill"] / arm["ring"]["slots"] for arm in arms.values()), default=0.0)
     now = status["recording"]
     recording = f", {PurePath(now['path']).name} {now['recorded_lines']} lines" if now else ""
@@ -103,6 +104,7 @@ def _capacity(status: Facts) -> str | None:
 
 def _recoveries(status: Facts) -> str | None:
     """Recordings that were not sealed by their recorder, and the results of their recovery."""
+    # The state says already that it was recovered.
     shown = [
         f"{PurePath(one['path']).name} {one['state']}: {one['text'].removeprefix('recovered: ')}"
         for one in status["recoveries"][-RECOVERIES:]
@@ -136,6 +138,7 @@ def _arm(arm: Facts) -> dict[str, str]:
         "preroll": str(arm["preroll"]),
         "recorded": str(arm["recorded"]),
         "missing": str(arm["missing"]),
+        # Only the causes that have lost lines: the others would make the column wider than a terminal.
         "lost": ", ".join(f"{cause} {lines}" for cause, lines in arm["lost"].items() if lines) or "0",
         "saturated": f"{arm['saturated']} ({arm['saturated_part']:.1%} now)",
         "ring": f"{ring['fill']} of {ring['slots']}, peak {ring['peak']}",
@@ -162,7 +165,8 @@ def _disk(disk: Facts | None) -> str | None:
         return None
     seconds, free = disk["seconds_to_full"], quantity(disk["free_bytes"], "B")
     left = f"{seconds:.0f} s"
-    for unit, length_s in (("min", 60), ("h", 3600), ("days", 86400)):
-        if seconds >= 2 * length_s:
-            left = f"{seconds / length_s:.3g} {unit}"
+    for unit, length_s in (("min", 60), ("h", 3600), ("days", 86400), ("years", 365.25 * 86400)):
+        if (count := seconds / length_s) >= 2:
+            # No exponent even for a disk that hardly fills, which lasts for thousands of years.
+            left = f"{count:.3g} {unit}" if count < 999.5 else f"{count:.0f} {unit}"
     return f"{disk['directory']}, {free} free, full in {left} at {quantity(disk['bytes_per_s'], 'B/s')}"

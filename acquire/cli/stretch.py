@@ -110,4 +110,5 @@ def first_ns(recording: Recording) -> int:
     row = recording.first_available_line - recording.first_line
     if row >= recording.lines:
         raise UsageError(f"{recording} has no lines")
+    # Of arm a: line ℓ of both arms has one line start, and one time.
     return int(recording.arms["a"].read("time", row, row + 1)[0]) - round(row * recording.line_period_ns)

@@ -60,6 +60,7 @@ def tiles_of(recording: Recording, text: str | None) -> tuple[Tile, ...]:
         return ()
     if text is None:
         return fibre.tiles
+    # Nine digits at most: Python refuses to convert thousands.
     found = re.fullmatch(r"(\d{1,9})(?:-(\d{1,9}))?,(\d{1,9})(?:-(\d{1,9}))?", text)
     if found is None:
         raise UsageError(
@@ -68,6 +69,7 @@ def tiles_of(recording: Recording, text: str | None) -> tuple[Tile, ...]:
     top, bottom, left, right = (None if each is None else int(each) for each in found.groups())
     last = Tile(top if bottom is None else bottom, left if right is None else right)  # type: ignore[arg-type]  # digits
     first = Tile(top, left)  # type: ignore[arg-type]  # digits
+    # Before the range is made: of such numbers it could have 10^18 tiles.
     fibre.check_tile(first)
     fibre.check_tile(last)
     tiles = tuple(

@@ -6,6 +6,7 @@ import itertools
 import os
 import shlex
 import sys
+from collections import Counter
 from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -119,6 +120,7 @@ def tradeoff(
     from acquire.reconstruct.learned import remember
 
     kinds = tuple(parse_voxels(text) for text in voxels or ["3x1"])
+    # Of all solvers only those that can be imported: somebody's broken plug-in must not end a study.
     combinations = list(
         itertools.product(solver or SOLVERS.working(), preset or ("fast", "balanced"), dtype or ("float32",))
     )
@@ -212,6 +214,7 @@ def _cases(
 
     (first_line, lines, repeats), cases, effects = extent, [], None
     wells = full_wells(full_well or ["1e4"])
+    stems = Counter(Path(source).stem for source in set(sources))
     for source in dict.fromkeys(sources):
         if source in SCENES:
             cases += [procedural(source, each, lines) for each in wells]
@@ -226,7 +229,9 @@ def _cases(
         given = tile_of(recording, tile)
         used = representative_tile(recording, () if given is None else (given,), (first, lines))
         recording.cut(first, lines, used)  # raises for missing lines, before anything is measured
-        cases.append(recording_case(Path(source).stem, recording, first, lines, APART, used))
+        # Runs of one name are repeats: recordings that share theirs are told apart by their places.
+        name = source if stems[Path(source).stem] > 1 else Path(source).stem
+        cases.append(recording_case(name, recording, first, lines, APART, used))
     return cases, effects
 
 
@@ -236,10 +241,14 @@ def _opened(source: str, out: Path, lines: int) -> tuple[Recording, Study | None
     from acquire.simulate import bench_of, simulate, study
     from acquire.store import open_recording
 
+    # A recording is a directory or a URL, a scene a file or a name.
     if "://" in source or os.path.isdir(source):  # noqa: PTH112  # Path.is_dir raises for an impossible name
         recording = open_recording(source)
         return recording, None
-    scene, place = load_scene(source), out / f"{Path(source).stem}.zarr"
+    scene, stem = load_scene(source), Path(source).stem
+    # Scenes in different directories may have one name.
+    places = (out / f"{stem}{'' if number == 1 else f'-{number}'}.zarr" for number in itertools.count(1))
+    place = next(each for each in places if not each.exists())
     rig = load_rig(scene.rig)
     with activity_progress(f"recording {source}") as report:
         simulate(rig, scene, place, lines)

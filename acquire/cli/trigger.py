@@ -18,7 +18,8 @@ from acquire.cli.durations import seconds_between
 from acquire.cli.output import JsonFlag, print_facts, print_json, say
 from acquire.cli.trigger_device import ConfigOption, SetOption, UrlOption, device_of
 from acquire.cli.trigger_patterns import blink, square
-from acquire.errors import TriggerError, UsageError
+from acquire.codes import ListedCode
+from acquire.errors import TriggerError
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -70,7 +71,7 @@ def load(
         Path,
         typer.Argument(
             metavar="FILE",
-            help="File with the code: text of 0 and 1 (white space is ignored), or a .npy array.",
+            help="File with the code: text of 0 and 1 (white space is ignored) or of 0x…, or a .npy array.",
         ),
     ],
     config: ConfigOption = "rig-demo",
@@ -133,6 +134,7 @@ def arm(
             tag_every_lines=rig.trigger.tag_every_lines,
         )
         if memory:
+            # A run states its code bit by bit: what is in the device is read back.
             run = replace(run, code=LoadedCode(driver.device().read_code(driver.device().code_length())))
         driver.prepare(run)
         fit = driver.start() if start else None
@@ -178,6 +180,7 @@ def selftest(
     with device_of(config, url, settings) as (driver, _):
         result = driver.device().self_test()
     failed = [name.removesuffix("_failed") for name, bit in result.items() if name != "done" and bit]
+    # A self-test that was not run has found nothing wrong, either.
     if failed or not result["done"]:
         raise TriggerError(f"the self-test failed: {', '.join(failed) or 'it was not run'}")
     if json:
@@ -237,18 +240,9 @@ def _watch(device: Device, seconds: float | None) -> Iterator[TagRecord]:
 
 def _read_code(file: Path) -> NDArray[np.uint8]:
     """Read the bits of a code, each 0 or 1. Raises UsageError for other contents."""
-    import numpy as np
+    from acquire.exchange import parse_code
 
-    try:
-        if file.suffix == ".npy":
-            # A pickle could run any code.
-            bits = np.asarray(np.load(file, allow_pickle=False))
-        else:
-            text = "".join(file.read_text(encoding="ascii").split())
-            # Characters below "0" wrap around to large numbers, which are refused below.
-            bits = np.frombuffer(text.encode(), np.uint8) - ord("0")
-    except (OSError, ValueError) as error:
-        raise UsageError(f"{file} cannot be read as a code: {error}") from error
-    if bits.ndim != 1 or not len(bits) or not np.isin(bits, (0, 1)).all():
-        raise UsageError(f"{file} is not a code", possible="one row of 0 and 1")
-    return bits.astype(np.uint8)
+    # By an absolute path, since a name such as 0x1f would be read as the bits themselves.
+    code = parse_code(f"bits:{file.absolute()}")
+    assert isinstance(code, ListedCode)
+    return code.bits(0, code.length)

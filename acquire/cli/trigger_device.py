@@ -64,4 +64,5 @@ def device_of(
     try:
         yield driver, rig
     finally:
+        # Not closed, which would stop a run that is to go on (`arm --start`).
         driver.release()

@@ -130,6 +130,7 @@ def _run(
     if json:
         print_json(facts | {"lines": lines} | counted)
         return
+    # A camera without a strobe answers no pulse: there is nothing to count.
     strobes = {
         f"camera {arm}": f"{counted[f'strobe_{arm}_seen']} strobes, {counted[f'strobe_{arm}_missed']} missed"
         for arm, output in (("a", rig.trigger.a), ("b", rig.trigger.b))
@@ -154,6 +155,7 @@ def _facts(rig: RigConfig, wave: SquareWave, clock_hz: int) -> dict[str, Any]:
     """Describe the signals on the pins, by their names in `firmware/ELECTRICAL.md`."""
     substep_s = wave.substep_ticks / clock_hz
     per_line = rig.trigger.line_start == "per-line"
+    # Otherwise the cameras get a pulse in every sub-step (trigger.line_start).
     pulses_hz = 1 / substep_s / (rig.geometry.substeps if per_line else 1)
     hz = wave.frequency_hz(clock_hz)
     lit_s = wave.half_substeps * substep_s

@@ -122,9 +122,11 @@ def not_installed(error: ModuleNotFoundError) -> UsageError:
 
     requirements = metadata.requires("tdi-acquire") or []
     package = _PACKAGES.get(module, module).lower()
+    # Distributions have hyphens where modules have underscores.
     wanted = (one for one in requirements if one.lower().replace("-", "_").startswith(package))
     extras = {found[1] for one in wanted if (found := _EXTRA.search(one))}
     command = next((word for word in sys.argv[1:] if not word.startswith("-")), "")
+    # These bring everything; a smaller one will do.
     extras -= {"all", "dev"}
     whole = _WHOLE.get(command, "reconstruct")
     extra = whole if whole in extras else min(extras, default=None)
@@ -140,6 +142,7 @@ def _usage_error(error: Any) -> UsageError:
     command = context.command_path if context is not None else "acquire"
     where = f"{command.removeprefix('acquire').lstrip()}: ".removeprefix(": ")
     message = own_words(error.message if near else error.format_message())
+    # What was probably meant is added below, in our own words.
     message = message.partition(" Did you mean")[0].rstrip(".")
     # click's messages have no verb in these two cases
     sentence = message[:1].lower() + message[1:]

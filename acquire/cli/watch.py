@@ -31,6 +31,7 @@ def watch_status(socket: Path | None, every_s: float, *, as_json: bool) -> None:
     with stop_on_interrupt("ending") as stop_requested, _display(as_json=as_json) as draw:
         while not stop_requested.is_set():
             draw(status)
+            # Not by sleeping, which Ctrl-C could not end: its handler only sets this event.
             stop_requested.wait(max(SHORTEST_S, every_s))
             try:
                 status = client.status().model_dump(mode="json")

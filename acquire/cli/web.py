@@ -105,6 +105,7 @@ def _settings(
         settings = WebConfig.model_validate_json(json.dumps(facts["web"]))
         return Path(facts["socket"]), Path(facts["directory"]), settings
     rig = None if config is None else load_rig(config)
+    # A rig without [web] only means that the daemon starts no page.
     settings = (rig.web if rig else None) or WebConfig()
     changes = {key: value for key, value in (("host", host), ("port", port)) if value is not None}
     if changes:  # validated again, because another address may need a certificate

@@ -7,6 +7,7 @@ from typing import Annotated, Any
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
 
+# As many as Linux allows in a path (PATH_MAX).
 MOST_CHARACTERS = 4096
 """Longest text in a file, such as a path, a URL or a name."""
 MOST_SECONDS = 1e9
@@ -24,6 +25,8 @@ class FrozenModel(BaseModel):
     ``true`` is not accepted as a number, nor ``"64"`` or ``64.0`` as a count.
     """
 
+    # Strict, since a rig with `stages = true`, which pydantic otherwise takes for 1, failed only when it was
+    # armed.
     model_config = ConfigDict(
         extra="forbid", frozen=True, allow_inf_nan=False, strict=True, str_max_length=MOST_CHARACTERS
     )
@@ -39,6 +42,7 @@ class FrozenModel(BaseModel):
 
 
 def _tuples(items: list[Any]) -> tuple[Any, ...]:
+    # Also the lists in a list: a camera's settings are such a list.
     return tuple(_tuples(item) if isinstance(item, list) else item for item in items)
 
 
@@ -48,6 +52,7 @@ def _without_null(path: Path) -> Path:
     return path
 
 
+# Not strict: pydantic would accept objects of the class Path only, and a file holds texts.
 FilePath = Annotated[Path, Field(strict=False), AfterValidator(_without_null)]
 """A path, written as text in files."""
 Seconds = Annotated[float, Field(ge=0, le=MOST_SECONDS)]

@@ -25,6 +25,7 @@ class LineOutputConfig(FrozenModel):
 
     enable: bool = True
     delay_ticks: int = Field(default=0, ge=0, lt=2**24, description="from the line's start to the pulse")
+    # 90 ticks are 1 µs at the default clock.
     width_ticks: int | None = Field(
         default=None, ge=1, lt=2**24, description="absent: a third of the pulse period, at most 90"
     )
@@ -100,6 +101,7 @@ class TriggerConfig(FrozenModel):
     @property
     def watchdog_ticks(self) -> int:
         """``watchdog_s`` in ticks of the trigger, rounded up."""
+        # A time of less than a tick rounded down would be 0, which turns the watchdog off.
         return math.ceil(self.watchdog_s * self.clock_hz)
 
     @property
@@ -153,6 +155,7 @@ class CameraConfig(FrozenModel):
         default="",
         description="GenTL producer; absent: those of GENICAM_GENTL64_PATH. 'aravis': the camera's address",
     )
+    # The order matters: in GenICam a selector decides which feature the name after it refers to.
     settings: tuple[tuple[GentlModule, str, bool | int | float | str], ...] = Field(
         default=(),
         description="[module, feature, value] in the order in which they are written; 'aravis': module "
@@ -165,6 +168,7 @@ class CameraConfig(FrozenModel):
     first_column: int = Field(
         default=0, ge=0, le=2**16, description="layout 'compact': first column of the arm's image"
     )
+    # Not always to be asked of the camera: GigE Vision counts in 16 bits, or in 64 with extended ids.
     frame_id_bits: int = Field(
         default=0, ge=0, le=64, description="bits of a frame id; 0: detected when the ids wrap around"
     )

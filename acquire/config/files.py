@@ -65,6 +65,7 @@ def find(name: str | Path, beside: Path | None = None, kind: str = "") -> Path:
     elif not _may_look_at(name):
         why = "is in a directory that this user may not enter"
     else:
+        # A link whose target is gone is a file to `lexists`, and none to `isfile`.
         why = "is not a regular file" if os.path.lexists(name) else "does not exist"
     what = f"{kind} file" if kind else "configuration file"
     near = did_you_mean(str(name), builtin_names(kind))
@@ -147,6 +148,7 @@ def parse_settings(settings: Sequence[str]) -> dict[str, Any]:
         if not equals:
             raise ConfigError(f"setting {shown(setting)} has no '='", possible=_SETTINGS)
         try:
+            # RecursionError: tomllib has no limit of its own for brackets in brackets.
             overrides[key.strip()] = tomllib.loads(f"value = {value}")["value"]
         except (ValueError, RecursionError) as error:
             # Only what can be pasted into a shell as it is.

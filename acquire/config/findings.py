@@ -26,6 +26,7 @@ def explained(error: ValidationError, model: type[BaseModel], path: Path | str) 
         keys, allowed = _locate(model, item["loc"])
         key = shortened(".".join(keys)) or "(file)"
         why = shortened(own_words(item["msg"]), 400)
+        # pydantic's own sentence, "Extra inputs are not permitted", does not name the keys that are.
         if item["type"] == "extra_forbidden":
             lines.append(f"  {key}: unknown key; allowed here: {', '.join(allowed) or 'none'}")
         elif item["type"] == "missing":

@@ -63,6 +63,7 @@ class SegmentPlan(FrozenModel):
         """Return the length in whole sub-steps; None if it is open."""
         if self.lines is not None:
             return self.lines * substeps_per_line
+        # A time below half a sub-step would otherwise round to a sub-segment of no length.
         return self.substeps if self.seconds is None else max(1, round(self.seconds / substep_s))
 
 

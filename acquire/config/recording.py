@@ -124,6 +124,8 @@ class RecordingConfig(FrozenModel):
     @classmethod
     def _is_a_place(cls, url: str | None) -> str | None:
         """Refuse secrets, because the configuration is stored in every recording."""
+        # pydantic does not check a default, but a recording holds its rig with every key, and null for this
+        # one.
         if url is None:
             return None
         parts = urlsplit(url)

@@ -56,10 +56,12 @@ class PrbsConfig(FrozenModel):
     """Maximal-length pseudo-random exposure code."""
 
     kind: Literal["prbs"] = "prbs"
+    # Of degree 64 no run sees the code repeat: 2**64 sub-steps of 10 µs last six million years.
     degree: int = Field(default=64, description="degree of the register: " + ", ".join(map(str, TAPS)))
     seed: int = Field(
         default=1, ge=0, lt=SEED_END, description="any number; the register's first state is derived from it"
     )
+    # A text, because JSON readers in other languages do not keep 64 bits of a number exactly.
     state: str | None = Field(
         default=None,
         pattern="^0x[0-9a-f]+$",
@@ -168,6 +170,7 @@ class RigConfig(FrozenModel):
     code: Annotated[
         PrbsConfig | ConstantCodeConfig, Field(discriminator="kind"), BeforeValidator(_default_to_prbs)
     ] = PrbsConfig()
+    # Not made with the class: that would import the default driver, which is part of the simulator.
     trigger: TriggerConfig = Field(default_factory=TriggerConfig)
     cameras: CamerasConfig
     fibre: FibreConfig | None = Field(
@@ -182,6 +185,7 @@ class RigConfig(FrozenModel):
         "relative to this file; every recording gets a copy",
     )
     check: CheckConfig = CheckConfig()
+    # Made with each rig: the default depends on the environment (XDG_RUNTIME_DIR).
     control: ControlConfig = Field(default_factory=ControlConfig)
     simulation: SimulationConfig = SimulationConfig()
     service: ServiceConfig = ServiceConfig()
@@ -260,6 +264,8 @@ class RigConfig(FrozenModel):
         if _is_recorded(info):
             return self
         passing_hz = self.passing_hz
+        # At 50 000 tags/s the supervisor fell behind, and the run ended as if the camera had not waited for
+        # the trigger.
         fewest = math.ceil(passing_hz / MOST_TAGS_PER_S)
         if self.trigger.tag_every_lines < fewest:
             raise ValueError(
@@ -402,6 +408,7 @@ class RigConfig(FrozenModel):
     @property
     def stall_timeout_s(self) -> float:
         """Time without a line after which an arm counts as stalled; until then a camera may be reopened."""
+        # Longer than the wait for a camera that is gone: its arm would otherwise count as stalled first.
         return max(self.stream.stall_s, self.stream.reopen_s + 1.0)
 
     @property

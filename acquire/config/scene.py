@@ -75,6 +75,7 @@ class WindowPhase(FrozenModel):
 
     duration_s: Seconds = Field(gt=0)
     axis: Literal["row", "column", "open"] = "open"
+    # Beyond the edges as well: in Fig. 8 the slit comes into the field at 1.1 and leaves it at -0.1.
     begin: float = Field(default=0.0, ge=-1, le=2, description="middle of the slit")
     end: float = Field(default=1.0, ge=-1, le=2)
     width: float = Field(default=0.2, gt=0, le=2)
@@ -129,6 +130,8 @@ class OpticsConfig(FrozenModel):
     raw_bits: int = Field(
         default=12, ge=1, le=16, description="emulated: bits of the lines before they are merged"
     )
+    # With as many as a line of the paper's instrument has, both kinds of TDI see the same fine pixels (Fig.
+    # 6).
     baseline_factor: int = Field(
         default=3, ge=1, le=16, description="interline: the scene's sub-steps per transfer of the sensor"
     )

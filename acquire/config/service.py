@@ -56,6 +56,7 @@ class HooksConfig(FrozenModel):
     @classmethod
     def _is_http(cls, url: str | None) -> str | None:
         """Refuse secrets, because the configuration is stored in every recording."""
+        # A recording's rig has null for a webhook that was not given: it passes like any valid URL.
         parts = urlsplit(url or "http://x")
         if parts.scheme not in ("http", "https") or not parts.hostname:
             raise ValueError("it is not an http or https URL")

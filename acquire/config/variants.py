@@ -122,9 +122,11 @@ def _class_of(group: Group, name: str) -> Any:
     try:
         return group.load(name)
     except ConfigError as error:
+        # A ConfigError would pass through pydantic as it is, without the file and the key.
         raise PydanticCustomError("unknown_kind", "{why}", {"why": str(error)}) from error
 
 
+# Building a validator takes ten times as long as using it (10 µs).
 @cache
 def _tagged(kind: str, model: type[BaseModel]) -> SchemaValidator:
     """Return the validator of a union with one member, so that errors have its name in their location."""

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from acquire.config.recording import RecordingConfig
     from acquire.daemon.messages import ArmRequest, LightCode, StartRequest
     from acquire.rig import Rig
-    from acquire.store import Codec, CodecChoice
+    from acquire.store import CodecChoice
 
 
 class Run:
@@ -56,15 +56,6 @@ class Run:
             return None
         return CalibrationStatus(path=handed.place, carried="calibration" in handed.attrs, text=handed.text)
 
-    @property
-    def _codec(self) -> Codec:
-        """The codec as configured, or as chosen by `arm`."""
-        configured = self._config.recording.codec
-        if configured != "auto":
-            return configured
-        # Before `arm` there is none, and nothing that it could pack.
-        return self._choice.codec if self._choice else "none"
-
     def arm(self, progress: Callable[[str], object] = lambda _: None) -> None:
         """Start cameras and trigger; on failure everything is undone and the first error raised.
 
@@ -81,6 +72,10 @@ class Run:
     def spec(self) -> RecordingSpec:
         """Return the recording's specification; the recorder fills in its first line."""
         config = self._config
+        codec = config.recording.codec
+        if codec == "auto":
+            # Chosen by `arm`. Before that there is none, and nothing that it could pack.
+            codec = self._choice.codec if self._choice else "none"
         return RecordingSpec(
             run_id=self.run_id,
             stages=config.geometry.stages,
@@ -97,7 +92,7 @@ class Run:
             extra=self._rig.describe()
             | self._calibration.attrs
             | ({"codec_choice": self._choice.to_attrs()} if self._choice else {}),
-            codec=self._codec,
+            codec=codec,
             layout=self._rig.layout,
             fibre=config.laid_out,
             **storage_settings(config),

@@ -58,12 +58,20 @@ def unit_text(rig: RigConfig, config: Path, *, user: bool, account: str | None =
     python = _word(Path(sys.executable))
     command = f"{python} -m acquire serve --config {_word(config.absolute())}"
     who = account or pwd.getpwuid(os.geteuid()).pw_name
+    # Of this host's groups, those whose members may use ports and USB devices.
+    here = {group.gr_name for group in grp.getgrall()}
+    groups = " ".join(name for name in ("dialout", "plugdev") if name in here)
+    socket = rig.control.socket
+    # The default one is that of the service's environment.
+    listens = "" if socket == default_socket() else f" --socket {_word(socket.absolute())}"
     service = [
         "Type=notify",
         "NotifyAccess=main",
         f"ExecStart={command}",
-        f"ExecReload={python} -m acquire reload{_socket(rig)}",
-        *([] if user else [f"User={who}", *_groups(), "RuntimeDirectory=acquire"]),
+        f"ExecReload={python} -m acquire reload{listens}",
+        *([] if user else [f"User={who}"]),
+        *([] if user or not groups else [f"SupplementaryGroups={groups}"]),
+        *([] if user else ["RuntimeDirectory=acquire"]),
         # The directory of `SOCKET`, which is then the default socket of the daemon.
         *([] if user else ["RuntimeDirectoryMode=0700", "Environment=XDG_RUNTIME_DIR=/run/acquire"]),
         f"WorkingDirectory={_quoted(recordings)}",
@@ -127,12 +135,6 @@ def _hardening(recordings: Path, rig: RigConfig) -> list[str]:
     ]
 
 
-def _socket(rig: RigConfig) -> str:
-    """Return the option for a socket that is not the default one of the service's environment."""
-    socket = rig.control.socket
-    return "" if socket == default_socket() else f" --socket {_word(socket.absolute())}"
-
-
 def _memory(rig: RigConfig) -> list[str]:
     """Return the settings for memory shortage, with comments for administrators who want to change them."""
     needed_mb = math.ceil((sum(needed_bytes(rig)) + PROCESSES_BYTES) / 1e6)
@@ -144,13 +146,6 @@ def _memory(rig: RigConfig) -> list[str]:
         "# would have to include the memory of the videos that jobs of the page compute.",
         f"MemoryLow={needed_mb}M",
     ]
-
-
-def _groups() -> list[str]:
-    """Return the setting for this host's groups whose members may use ports and USB devices."""
-    here = {group.gr_name for group in grp.getgrall()}
-    names = [name for name in ("dialout", "plugdev") if name in here]
-    return [f"SupplementaryGroups={' '.join(names)}"] if names else []
 
 
 def _quoted(path: Path) -> str:

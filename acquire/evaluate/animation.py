@@ -42,6 +42,7 @@ def save_animation(
             return step
         # how large a file becomes is known only once it is written
         step *= 2
+    # The last attempt is there, too large, and must not be taken for the result.
     path.unlink(missing_ok=True)
     raise UsageError(
         f"an animation of {frames} frames does not fit into {max_bytes} bytes",
@@ -84,6 +85,7 @@ def draw_frame(result: DemoResult, frame: int) -> Image.Image:
     width = len(panels) * (PANEL_PX + GAP_PX) - GAP_PX
     picture = Image.new("RGB", (width, PANEL_PX + 2 * BAR_PX), "#12181f")
     draw = ImageDraw.Draw(picture)
+    # Pillow's own font: which others there are depends on the host.
     font = ImageFont.load_default(15)
     for i, (label, video) in enumerate(panels):
         left = i * (PANEL_PX + GAP_PX)

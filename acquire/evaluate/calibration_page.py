@@ -42,6 +42,7 @@ def write_page(known: Calibration, directory: Path, name: str, facts: Mapping[st
         drawings = {
             key: save_drawing(figure, directory, key) for key, figure in figures.items() if figure is not None
         }
+    # Without NaN, which Python writes but JSON does not have.
     text = json.dumps(known.to_attrs(), indent=1, allow_nan=False, ensure_ascii=False)
     (directory / "calibration.json").write_text(text + "\n", encoding="utf-8")
     # steps have a table of their own
@@ -71,6 +72,7 @@ def _columns(known: Calibration) -> Figure | None:
         for arm, value, error, good, colour in zip(
             ARMS, measured.value, measured.uncertainty, usable, SOLVER_COLOURS, strict=False
         ):
+            # matplotlib leaves a gap where a value is NaN.
             shown = np.where(np.isin(x, hidden.get(arm, [])) | ~good, np.nan, value)
             ax.fill_between(x, shown - 2 * error, shown + 2 * error, color=colour, alpha=0.25, lw=0)
             ax.plot(x, shown, ".-", color=colour, lw=1, ms=3, label=f"camera {arm.upper()}")

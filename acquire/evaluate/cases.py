@@ -73,6 +73,7 @@ def full_wells(words: Sequence[str]) -> list[float]:
             value = math.inf if word == "clean" else float(word)
         except ValueError:
             value = math.nan
+        # Not `<=`, which would be false for NaN and accept it.
         if not value > 1:
             raise UsageError(
                 f"the full well {word!r} cannot be read", possible="electrons, such as 1e4, or 'clean'"

@@ -102,6 +102,7 @@ def region_mean(video: NDArray[Any], mask: NDArray[np.bool_]) -> NDArray[np.floa
 
     Raises UsageError for a mask of another shape or without pixels.
     """
+    # NumPy would take a mask of integers for the numbers of frames and pixels.
     if video.ndim != 3 or mask.shape != video.shape[1:] or mask.dtype != np.bool_ or not mask.any():
         mask_text = f"{np.count_nonzero(mask)} pixels of a {mask.dtype} mask {mask.shape}"
         raise UsageError(
@@ -129,11 +130,13 @@ def fit_sine(
     values = np.asarray(values, np.float64)
     _check_curve(values, interval_s, harmonics)
     times_s = np.arange(len(values), dtype=np.float64) * np.float64(interval_s)
+    # The spectrum of a constant is rounding alone, and any sinusoid fits it.
     if frequency_hz is None and np.ptp(values) <= CONSTANT_SWING * np.abs(values).max():
         return fit_constant(values)
     if frequency_hz is None:
         if guess_hz is None:
             size = SPECTRUM_PADDING * len(values)
+            # Without the mean, whose peak at frequency 0 would reach over all others.
             spectrum = np.abs(np.fft.rfft(values - values.mean(), size))
             # Without its ends: no sinusoid of frequency 0, or of half the sampling rate, can be fitted.
             guess_hz = (1 + int(np.argmax(spectrum[1:-1]))) / (size * interval_s)
@@ -209,6 +212,7 @@ def _check_curve(values: NDArray[np.float64], interval_s: float, harmonics: int)
 def _visible_harmonics(frequency_hz: float, interval_s: float, harmonics: int) -> int:
     """Return the number of harmonics below half the sampling rate. Raises UsageError if there is none."""
     nyquist_hz = 0.5 / interval_s
+    # At half the sampling rate itself every sample of a sine can be 0, which leaves its amplitude open.
     if not 0 < frequency_hz < nyquist_hz:
         raise UsageError(
             f"a sinusoid of {frequency_hz} Hz cannot be fitted to samples every {interval_s:g} s",
@@ -253,5 +257,6 @@ def _project(
     for k in range(1, harmonics + 1):
         columns += [np.sin(k * angle), np.cos(k * angle)]
     design = np.stack(columns, axis=1)
+    # lstsq, since towards frequency 0 the columns become dependent on each other.
     coefficients = np.linalg.lstsq(design, values, rcond=None)[0].astype(np.float64, copy=False)
     return coefficients, values - design @ coefficients

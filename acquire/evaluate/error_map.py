@@ -39,6 +39,7 @@ def draw_error(file: VideoFile) -> Drawing | None:
         rows, columns = frame.shape
         left.imshow(frame, cmap="gray", vmin=0, vmax=full_scale)
         left.set_title("frame")
+        # The regions are stretched over the frame's pixels, so that both pictures have one scale.
         image = right.imshow(percent, cmap="viridis", vmin=0, extent=(0, columns, rows, 0))
         right.set_title("error (%)")
         for ax in (left, right):

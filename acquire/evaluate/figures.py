@@ -107,6 +107,7 @@ def frames(result: DemoResult) -> Figure:
         stamp(ax, f"#{frame}\n{result.frame_ms[frame]:.2f} ms")
     _colour_bar(figure, axes[0], "intensity", "neither")
     # the third row is the error of the first solver
+    # An arrow at the end of the scale: larger errors than `ERROR_SHARE` have the same colour.
     _colour_bar(figure, axes[2], "|error|", "max")
     return figure
 
@@ -158,6 +159,7 @@ def psnr_over_time(result: DemoResult) -> Figure:
     ax = figure.subplots()
     for solver, colour in _coloured(result):
         ax.plot(result.frame_ms, solver.psnr_per_frame, color=colour, lw=1.1, label=solver.label)
+        # Of the whole video, which is not the mean of these: the errors are averaged, and not their decibels.
         ax.axhline(solver.psnr_db, color=colour, lw=0.9, ls=(0, (5, 4)))
     ax.set_xlim(result.frame_ms[0], result.frame_ms[-1])
     ax.set_xlabel("time since start (ms)")

@@ -61,6 +61,7 @@ def band(runs: Sequence[Run], name: str, clock: Clock = "seconds") -> Band | Non
         known = [(getattr(each, clock), getattr(each, name)) for each in run.points]
         steps = [(at, value) for at, value in known if value is not None and math.isfinite(value)]
         if steps:
+            # By time: `searchsorted` needs it below.
             stairs.append(np.array(sorted(steps)))
     if not stairs:
         return None

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
 
 SSIM_SIGMA = 1.5
 """Standard deviation of the Gaussian window in pixels (Wang et al. 2004, Section III.C)."""
+# Gives a window of 11 × 11 pixels, that of Wang et al.
 SSIM_TRUNCATE = 3.5
 SSIM_RADIUS = int(SSIM_TRUNCATE * SSIM_SIGMA + 0.5)
 """The window extends 5 pixels to each side; a border of that width is left out of the mean."""
@@ -103,6 +104,7 @@ def checked_peak(truth: NDArray[Any], peak: float | None = None) -> float:
 
 def _mean_squared_error(video: NDArray[Any], truth: NDArray[Any], peak: float) -> float:
     """Return the error in units of the peak, whose square may be too large or too small for a number."""
+    # As doubles from the first step: the difference of unsigned integers would wrap around.
     return float(np.mean(np.square(np.subtract(video, truth, dtype=np.float64) / peak)))
 
 

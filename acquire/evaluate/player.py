@@ -17,6 +17,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+# In the page, as base64, they take a third more.
 MAX_BYTES = 400_000
 QUALITY = 88
 
@@ -49,6 +50,7 @@ class Clip:
 def clip_of(pictures: Sequence[Image.Image], max_bytes: int = MAX_BYTES) -> Clip:
     """Encode the pictures as WebP; every second one is dropped until they fit into ``max_bytes``."""
     frames, step = [webp(picture, QUALITY) for picture in pictures], 1
+    # Two frames are the least that can be played.
     while len(frames) > 2 and sum(map(len, frames)) > max_bytes:
         # by halves, so that the frames that are left stay equally far apart
         frames, step = frames[::2], 2 * step

@@ -68,7 +68,8 @@ def check_suffix(path: Path) -> None:
             + (f"{path.suffix} is not a known format" if path.suffix else "its name has no suffix"),
             possible=".mp4 (a movie), .gif or .webp (an animation), .png (a sheet of stills), "
             ".html (a page with a player)",
-            hint=f"--out {path.with_suffix('.mp4')}",
+            # pathlib has no other suffix for a path without a name, such as "." and "/"
+            hint=f"--out {path.with_suffix('.mp4') if path.name else 'NAME.mp4'}",
         )
 
 
@@ -88,6 +89,7 @@ def common_times(panels: Sequence[Panel], count: int) -> NDArray[np.int64]:
             "the videos have no time in common, so they cannot be shown side by side",
             hint="one page or movie for each of them",
         )
+    # Whole steps, so that the instants stay equally far apart.
     step = -(-len(times) // max(1, count))
     chosen: NDArray[np.int64] = times[::step]
     return chosen
@@ -124,6 +126,7 @@ def render(
             _sheet(list(pictures())).save(path)
         case ".mp4":
             _write_mp4(path, pictures(), look.fps)
+        # Pillow writes an animation only once it has all of its pictures.
         case ".webp":
             write_webp(path, list(pictures()), round(1000 / look.fps))
         case ".gif":
@@ -141,6 +144,7 @@ def _picture(
     top = bar if len(panels) > 1 else 0
     width = sum(each.width for each in greys) + GAP_PX * (len(greys) - 1)
     picture = Image.new("RGB", (width + width % 2, top + look.panel_px + bar), PAPER)
+    # Pillow's own font: which others there are depends on the host.
     draw, font, left = ImageDraw.Draw(picture), ImageFont.load_default(15), 0
     for panel, each in zip(panels, greys, strict=True):
         picture.paste(each, (left, top))
@@ -200,6 +204,7 @@ def _write_mp4(path: Path, pictures: Iterator[Image.Image], fps: float) -> None:
     with av.open(str(path), "w") as container:
         # the codec's clock needs a fraction with small terms
         stream = container.add_stream("libx264", rate=Fraction(fps).limit_denominator(1000))
+        # As in the movies of `acquire export`.
         stream.pix_fmt, stream.options = "yuv420p", {"crf": "18"}
         # the codec halves the resolution of colours, so it needs even sizes
         stream.width, stream.height = (side - side % 2 for side in first.size)

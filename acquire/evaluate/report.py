@@ -70,6 +70,7 @@ def write_report(result: DemoResult, directory: Path) -> Path:
         "slowed_down": round(animation.FRAME_DURATION_MS / shown_ms),
     }
     summary = summarise(result) | {"animation": facts}
+    # JSON has no NaN: `summarise` gives None in its place, and anything else is refused here.
     (directory / SUMMARY).write_text(json.dumps(summary, indent=2, allow_nan=False) + "\n", encoding="utf-8")
     page = directory / PAGE
     page.write_text(render_page(summary, drawings, movie), encoding="utf-8")

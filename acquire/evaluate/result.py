@@ -73,6 +73,7 @@ class CaptureFacts:
     arms: Mapping[str, ArmLedger]
 
 
+# Not compared by value: `==` of two arrays is an array.
 @dataclass(frozen=True, slots=True, eq=False)
 class Region:
     """An area whose intensity is evaluated: ``mask`` (row, column) bool, ``theory`` (t,) in the scene's

@@ -75,6 +75,7 @@ def ledger_summary(ledger: ArmLedger) -> dict[str, Any]:
         "discarded": ledger.discarded,
         "recorded": ledger.recorded,
         "missing": ledger.missing,
+        # JSON has no other keys than texts.
         "lost": {str(cause): lines for cause, lines in ledger.lost.items()},
         "ring_peak": ledger.ring_peak,
         "ring_slots": ledger.ring_slots,
@@ -140,6 +141,7 @@ def swing_summary(curve: CurveComparison) -> dict[str, float | None]:
         "theory_distortion_percent": rounded(100 * curve.theory.distortion, 1),
         "measured_distortion_percent": rounded(100 * curve.measured.distortion, 1),
     }
+    # With all its keys, so that the columns of a page and of a table do not depend on the curve.
     return dict.fromkeys(values) if curve.constant else values
 
 

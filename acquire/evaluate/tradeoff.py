@@ -128,6 +128,7 @@ class Judge:
         """Return the true voxels of `frames`; None if the truth is not known."""
         if self.scene is None and self.light is None:
             return None
+        # Kept: every solver, preset and dtype is compared with the same truth.
         if voxels not in self._truths:
             geometry, merges = self.segment.geometry, (voxels.spatial_merge, voxels.temporal_merge)
             if self.light is not None:
@@ -196,6 +197,7 @@ class Judge:
         for led, mask in zip(self.scene.leds, masks, strict=True):
             # below the Nyquist frequency of the frames
             visible = isinstance(led.drive, SineDrive) and 2 * led.drive.frequency_hz * interval_s < 1
+            # 16 frames are twice the unknowns of a sinusoid with its three harmonics.
             if not visible or not mask.any() or len(shown) < 16:
                 continue
             true = self.truth(voxels)
@@ -234,6 +236,7 @@ def measure(
     points: list[Point] = []
 
     def look(now: Look) -> None:
+        # By their ratio: the curves are drawn over the logarithm of time.
         if points and now.seconds < APART * points[-1].seconds:
             return
         begun = time.monotonic(), time.process_time()
@@ -251,6 +254,7 @@ def measure(
         None if progress is None else lambda step: progress(step.iteration, step.iterations),
         solver=solver,
         dtype=dtype,
+        # What a solver cannot do well is a result of a trade-off, too.
         refuse=False,
         look=look,
         # What explains the lines better, and how large the error is, take no part of the solver's time: the
@@ -258,6 +262,7 @@ def measure(
         check=False,
         error=False,
     )
+    # None, since the page's JSON cannot hold NaN.
     prediction = None if np.isnan(result.quality.prediction) else result.quality.prediction
     last = Point(result.iterations, result.seconds, result.processor_s, "end", prediction=prediction)
     # an observed result counts the making of its video, and may be later than the end

@@ -31,6 +31,7 @@ WIDTH_IN, HEIGHT_IN = 4.4, 3.3
 CLOCKS: dict[Clock, str] = {"seconds": "wall time (s)", "processor_s": "processor time, all threads (s)"}
 LINES = {"fast": ":", "balanced": "-", "best": "--"}
 MARKERS = {"fast": "o", "balanced": "s", "best": "D"}
+# With the truth there are six panels, in two rows of three.
 FRAMES = 5
 LEAST_OCTAVES, MANY_OCTAVES = 2.0, 3.5
 """Minimum range of a time axis, and range above which it has fewer ticks."""
@@ -93,6 +94,7 @@ def curves(runs: Sequence[Run], metric: Metric, clock: Clock) -> Figure:
         marks = (1, 2, 5) if octaves > MANY_OCTAVES else (1, 1.5, 2, 3, 5, 7)
         ax.xaxis.set_major_locator(LogLocator(subs=marks))
         ax.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+        # matplotlib also labels minor ticks where a logarithmic axis is short.
         ax.xaxis.set_minor_formatter(NullFormatter())
         _value_axis(ax, metric)
         # Empty lines for the legend: a solver has many curves and markers, and one entry.

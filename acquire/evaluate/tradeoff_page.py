@@ -135,6 +135,7 @@ def _movie(run: Run, truth: NDArray[Any] | None) -> dict[str, Any]:
         if each.frame is not None
     ]
     clip = clip_of(pictures)
+    # A clip leaves out pictures until it fits into the page, and with them their labels.
     labels = [in_caption(each) for each in run.points if each.frame is not None]
     return {"frames": clip.frames, "labels": labels[:: clip.step], "beside": truth is not None}
 
@@ -180,12 +181,14 @@ def _effects(study: Study) -> Figure:
     for worth, cost, size in zip(known, costs, sizes, strict=True):
         label = worth.effect.replace("_", " ")
         ax.annotate(label, (cost, size), textcoords="offset points", xytext=(7, 4), fontsize=8.5)
+    # The grey band: below 0.05 of the noise an effect can be left out, as `acquire simulate` says.
     ax.axhspan(ax.get_ylim()[0] if min(sizes) > 0.05 else min(sizes) / 3, 0.05, color=GRID, zorder=0, lw=0)
     ax.set(
         xscale="log",
         yscale="log",
         xlabel="cost (µs per line and arm)",
         ylabel="error of the lines without it\n(relative to their noise)",
+        # More room on the right, where the effects' names are.
         xlim=(min(costs) / 1.6, max(costs) * 3),
     )
     return figure

@@ -124,6 +124,7 @@ def _misfit(file: VideoFile) -> Drawing | None:
         return None
     width = -(-len(file.quality) // MOST_POINTS)
     padded = np.pad(file.quality.astype(np.float64), (0, -len(file.quality) % width), constant_values=np.nan)
+    # fmax leaves out NaN, which is in the padding and where a frame has no residual.
     worst = np.fmax.reduce(padded.reshape(-1, width), axis=1)  # the worst of the frames that share a point
     times_ms = (file.time_ns[::width] - file.time_ns[0]) / 1e6
     end_ms = times_ms[-1] + width * file.interval_ns / 1e6

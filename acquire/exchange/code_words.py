@@ -30,7 +30,8 @@ POSSIBLE = (
 def parse_code(text: str, *, repeats: bool = False) -> Code:
     """Parse a code; with ``repeats``, listed bits repeat. Raises UsageError that names the forms."""
     kind, _, rest = text.partition(":")
-    if kind == "prbs" and (found := re.fullmatch(r"(\d{1,2}):(0x[0-9a-fA-F]+|\d+)", rest)):
+    # A seed has at most 39 digits, and Python refuses to convert thousands.
+    if kind == "prbs" and (found := re.fullmatch(r"(\d{1,2}):(0x[0-9a-fA-F]+|\d{1,39})", rest)):
         degree, number = int(found[1]), found[2]
         if number.startswith("0x"):
             return PrbsCode(degree, int(number, 16))
@@ -49,7 +50,9 @@ def _bits(text: str) -> NDArray[np.uint8]:
         if path.suffix == ".npy":
             return _from_array(path)
         with refused(path, "read"):
+            # Twice the bits, which leaves room for white space between them.
             raw = read_regular(path, MOST_LISTED_BITS * 2)
+        # Other characters become ones that are no bits, and are refused below.
         text = "".join(raw.decode("ascii", "replace").split())
         if re.fullmatch("[01]+", text):
             return np.frombuffer(text.encode(), np.uint8) - ord("0")

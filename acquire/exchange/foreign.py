@@ -247,6 +247,7 @@ def _hdf5(path: Path, layout: Layout, held: ExitStack) -> LineFile:
     there: list[str] = []
 
     def visit(name: str, node: Any) -> None:
+        # h5py ends the visit as soon as this returns anything.
         if isinstance(node, h5py.Dataset) and node.ndim in {2, 3} and node.dtype.name in TYPES:
             there.append(f"/{name}")
 
@@ -297,6 +298,7 @@ def _raw(path: Path, layout: Layout, _: ExitStack) -> LineFile:
             hint="--skip-bytes for the bytes before the first line, or another --pixels or --dtype",
         )
     shape = (size // line_bytes, pixels)
+    # `str` includes the byte order, which a recording's own dtype no longer tells.
     facts = {"dtype": dtype.str, "skip_bytes": layout.skip_bytes}
     return LineFile(
         path=path,
@@ -325,6 +327,7 @@ def _tiff(path: Path, _: Layout, held: ExitStack) -> LineFile:
         )
     # tifffile states the type in native byte order, and the pixels are read as they are in the file.
     shape, dtype = tuple(map(int, series.shape)), np.dtype(file.byteorder + series.dtype.str[1:])
+    # As channels, which is how our own export writes the arms for ImageJ and OME.
     arms = len(shape) == 3 and series.axes.startswith("C") and shape[0] == 2
     lines = shape if arms else (math.prod(shape[:-1]), shape[-1])
     if series.dataoffset is not None:  # all pixels lie in one piece, without compression

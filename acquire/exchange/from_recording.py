@@ -117,6 +117,7 @@ def _steps(recording: Recording, rows: range) -> Iterator[tuple[int, int]]:
 
 
 def _of_arms(recording: Recording, rows: range, name: str) -> Iterator[Block]:
+    # One arm after the other: the pieces of an array follow each other in C order (`Block`).
     for number, arm in enumerate(ARMS):
         for start, stop in _steps(recording, rows):
             # More than a block only if a single group is: then it is read in parts.
@@ -175,6 +176,7 @@ def _means(lines: NDArray[Any], flags: NDArray[np.uint16], count: int) -> NDArra
     """Return the mean of each group of ``count`` lines without those that have no image; 0 if none has."""
     edges = np.arange(0, len(lines), count)
     there = (flags & NO_IMAGE) == 0
+    # In double, as in `_long_group`, so that both ways give the same mean.
     total = np.add.reduceat(np.where(there[:, None], lines, 0), edges, axis=0, dtype=np.float64)
     there = np.add.reduceat(there, edges, dtype=np.int64)
     return (total / np.maximum(there, 1)[:, None]).astype(np.float32)

@@ -122,6 +122,7 @@ def _columns(video: VideoFile, kept: range) -> Iterator[Array]:
     yield _column("time_ns", video.time_ns[kept.start : kept.stop], "UTC, ns since 1970")
     if video.trusted is not None:
         inside = np.isin(np.arange(kept.start, kept.stop), video.trusted)
+        # Not booleans, which h5py writes as an enumeration and not as numbers.
         yield _column("trusted", inside.astype(np.uint8), "1: the frame is sampled in full")
     if video.quality is not None:
         quality = video.quality[kept.start : kept.stop]

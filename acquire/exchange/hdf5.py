@@ -99,6 +99,7 @@ class _Disk:
 
 
 def _write_entry(file: Any, content: Content, advance: Callable[[int], object]) -> None:
+    # In NeXus a viewer finds what to plot by following these defaults from the root.
     file.attrs.update({"default": "entry", "creator": f"acquire {__version__}"})
     entry = _group(file, "entry", "NXentry", default="data")
     entry["title"] = content.title

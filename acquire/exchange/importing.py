@@ -39,6 +39,7 @@ SUBSTEP_TICKS = 1000
 """Ticks per sub-step of the clock if only the line rate is known."""
 MOST = 2**62
 """Limit of ticks, and of the time since line 0 (ns): with the time of line 0, 64 bits still suffice."""
+# `acquire info` shows the UTC of a clock that is so uncertain as unknown.
 UNKNOWN_NS = 2**62
 """Uncertainty of an unknown clock."""
 NO_ARM = "not_imported"
@@ -159,6 +160,7 @@ def _checked(arms: Mapping[str, Arm], instrument: Instrument, most_lines: int | 
             possible="the same number of lines in both arms",
             hint=f"--lines {min(counts.values())}, to take this number of each",
         )
+    # The same samples may come in either byte order.
     if len({source.file.dtype.newbyteorder("=") for source in arms.values()}) > 1:
         raise UsageError("the arms have different types", possible="uint8 or uint16 for both")
     for arm, source in arms.items():
@@ -217,6 +219,7 @@ def shifted(code: Code, start: int) -> Code:
         if count < 1:
             raise UsageError(f"--code-start {start} is beyond the {code.length} bits of the code")
         return ListedCode.of(code.bits(start, count), repeats=code.repeats)
+    # A constant code is the same from any bit on.
     return code
 
 
@@ -239,15 +242,6 @@ def _unknown(arms: Mapping[str, Arm], instrument: Instrument) -> list[str]:
     return found
 
 
-def _clock(instrument: Instrument) -> ClockFit:
-    """Return a clock whose tick 0 is placed so that the first line is read out at the given time."""
-    geometry = Geometry(instrument.stages, instrument.substeps, 1)
-    substep = instrument.substeps * instrument.first_line + geometry.readout_substep
-    relative = ClockFit(instrument.clock_hz, 0, UNKNOWN_NS)
-    first_ns = int(relative.time_ns(np.array([substep * instrument.substep_ticks], np.uint64))[0])
-    return ClockFit(instrument.clock_hz, (instrument.start_ns or 0) - first_ns, UNKNOWN_NS)
-
-
 def _spec(
     arms: Mapping[str, Arm], instrument: Instrument, run_id: str, unknown: tuple[str, ...], lines: int
 ) -> RecordingSpec:
@@ -259,6 +253,12 @@ def _spec(
         1 << max(4, lines.bit_length()),
     )
     usual = {"white_dn": float(np.iinfo(dtype).max), "black_level_dn": 0.0, "responsivity_dn": 1.0}
+    # Tick 0 of the clock is placed so that the first line is read out at the given time.
+    geometry = Geometry(instrument.stages, instrument.substeps, 1)
+    substep = instrument.substeps * instrument.first_line + geometry.readout_substep
+    relative = ClockFit(instrument.clock_hz, 0, UNKNOWN_NS)
+    first_ns = int(relative.time_ns(np.array([substep * instrument.substep_ticks], np.uint64))[0])
+    clock = ClockFit(instrument.clock_hz, (instrument.start_ns or 0) - first_ns, UNKNOWN_NS)
     return RecordingSpec(
         run_id=run_id,
         stages=instrument.stages,
@@ -266,7 +266,7 @@ def _spec(
         pixels=file.pixels,
         dtype=dtype.name,
         first_line=instrument.first_line,
-        clock=_clock(instrument),
+        clock=clock,
         code=shifted(instrument.code, instrument.code_start).to_attrs(),
         substep_ticks=instrument.substep_ticks,
         trigger={"model": "none: the lines are imported"},

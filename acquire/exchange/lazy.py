@@ -45,6 +45,7 @@ class Stack:
 
     def __getitem__(self, index: Any) -> NDArray[Any]:
         """Read the selected pictures. Raises UsageError for more than `MOST_BYTES`."""
+        # As in NumPy, an empty index selects everything.
         first, *rest = (index if isinstance(index, tuple) else (index,)) or (...,)
         # A viewer may slice only the last axes: the ellipsis then stands for the pictures, too.
         if first is Ellipsis:

@@ -29,10 +29,12 @@ GAP = 8
 
 def reader_for(path: str | list[str]) -> Callable[[Any], list[Layer]] | None:
     """Return the reader for a path; None if it is neither a recording nor a video of ours."""
+    # A list of paths is a stack of files to napari.
     if not isinstance(path, str):
         return None
     try:
         kind = format_of(path) or ""
+    # Not an error: napari asks every reader about every path.
     except AcquireError:
         return None
     if kind.startswith("acquire-video/"):

@@ -23,6 +23,7 @@ if TYPE_CHECKING:
 
     from acquire.exchange.content import Content
 
+# Headers and facts have to be within the offsets' reach, too.
 MOST_BYTES = 2**32 - 2**26
 """Largest image in a file with 32-bit offsets."""
 AXES = {"video": "TYX", "lines": "CYX"}
@@ -50,9 +51,11 @@ def write_tiff(path: Path, content: Content, advance: Callable[[int], object], *
             None,
             shape=content.image.shape,
             dtype=content.image.dtype,
+            # Stated, or tifffile would guess: it takes a last axis of 3 or 4 for colours.
             photometric="minisblack",
             metadata=_ome(content) if ome else _imagej(content),
             resolution=(1 / (x.step or 1.0), 1 / (y.step or 1.0)),  # pixels per unit
+            # TIFF knows inches and centimetres only; the unit is in ImageJ's or OME's own description.
             resolutionunit="NONE",
         )
         for array in beside:

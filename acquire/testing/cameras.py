@@ -112,12 +112,16 @@ class CameraContract:
         camera.close()
 
     def test_a_closed_camera_can_be_opened_again(self, stand: CameraStand) -> None:
+        # A grabber closes a camera that is gone, even if it cannot disarm it, and opens it again
+        # (stream.reopen_s).
         for _ in range(2):
             opened = stand.opener()
             opened.arm()
             opened.close()
 
     def test_opening_leaves_signals_and_warnings_as_they_were(self, stand: CameraStand) -> None:
+        # harvesters, for one, takes over SIGINT and changes the warning filters; a driver has to restore
+        # both.
         before = signal.getsignal(signal.SIGINT), list(warnings.filters)
         stand.opener().close()
         assert (signal.getsignal(signal.SIGINT), list(warnings.filters)) == before

@@ -51,6 +51,7 @@ class EffectContract:
         assert pickle.loads(pickle.dumps(effect)) == effect  # noqa: S301  # our own bytes
 
     def test_it_changes_lines_and_its_stages_say_whose_they_are(self, effect: Effect) -> None:
+        # An effect may act on one arm only, as a misregistration does.
         changed = False
         for arm in "ab":
             camera = small_bench((effect,)).camera(arm, CODE)
@@ -83,5 +84,6 @@ class EffectContract:
         np.testing.assert_array_equal(first.pixels, second.pixels, "equal seeds give different lines")
         after = np.random.get_state()[1].tolist()  # type: ignore[index]  # noqa: NPY002
         assert before == after, "it draws from numpy's global stream: use acquire.sim.effects.base.draws"
+        # Compared in shape only: an effect that draws no random numbers gives the same lines.
         other = replace(small_bench((effect,)), realisation=1).camera("a", CODE).read(0, 512)
         assert other.pixels.shape == first.pixels.shape

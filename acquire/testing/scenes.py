@@ -60,4 +60,5 @@ class SceneContract:
         assert masks.dtype == np.float32
         product = np.einsum("kt,krc->trc", light, masks)
         np.testing.assert_allclose(shown.frames(FIRST, COUNT), product, rtol=1e-4, atol=1e-6)
-        assert shown.intensity(0, 4, SUBSTEP_S / 3).shape == (len(masks), 4)  # steps of another duration
+        # The effect `pwm` asks for steps as long as its carrier period.
+        assert shown.intensity(0, 4, SUBSTEP_S / 3).shape == (len(masks), 4)

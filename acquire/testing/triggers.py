@@ -105,6 +105,7 @@ class TriggerContract:
         assert waited, "a wait for tags must end with its run"
 
     def test_closing_twice_is_closing_once(self, trigger: Trigger) -> None:
+        # Drivers may open their link only now; before, there would be nothing to close.
         trigger.identify()
         trigger.close()
         trigger.close()

@@ -14,6 +14,7 @@ import pytest
 
 from acquire.cli import control, main
 from acquire.cli.durations import seconds
+from acquire.cli.output import quantity
 from acquire.daemon.messages import (
     ArmStatus,
     DiskStatus,
@@ -240,3 +241,32 @@ def test_watching_the_status_lasts_until_ctrl_c_and_reports_a_daemon_that_ended(
     lines = cli("status", "--watch", "--every", "100ms", "--json").out.splitlines()
     assert [json.loads(line).get("state") for line in lines] == ["armed", "armed", None, "recording"]
     assert json.loads(lines[2])["error"]["error"] == "NoDaemonError"
+
+
+@pytest.mark.parametrize(
+    ("value", "words"),
+    [
+        (0.0, "0 B"),
+        (999.4, "999 B"),
+        (999.6, "1 kB"),
+        (33_333.3, "33.3 kB"),
+        (999_600.0, "1 MB"),
+        (2e15, "2 PB"),
+    ],
+)
+def test_quantities_have_no_exponent(value: float, words: str) -> None:
+    assert quantity(value, "B") == words
+
+
+@pytest.mark.parametrize(
+    ("left_s", "words"),
+    [(90, "90 s"), (1000, "16.7 min"), (86_400, "24 h"), (1e8, "3.17 years"), (1e12, "31688 years")],
+)
+def test_the_time_until_a_disk_is_full_has_no_exponent(
+    cli: Cli, answering: Callable[[Status], FakeClient], left_s: float, words: str
+) -> None:
+    disk = DiskStatus(
+        directory=Path("/data"), free_bytes=10**12, reserve_bytes=0, bytes_per_s=1e3, seconds_to_full=left_s
+    )
+    answering(status(State.ARMED, disk=disk))
+    assert f"full in {words} at" in cli("status").out

@@ -5,6 +5,7 @@ from __future__ import annotations
 import socket
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from io import BytesIO
 from pathlib import Path
 from typing import Any
 
@@ -261,3 +262,35 @@ def test_a_demo_has_a_socket_wherever_temporary_files_go(
     with pytest.raises(NoDaemonError, match="enough"):
         capture.record(DemoPlan(tmp_path), Journal())
     assert not asked[0].parent.exists()
+
+
+def npy(array: np.ndarray) -> bytes:
+    file = BytesIO()
+    np.save(file, array)
+    return file.getvalue()
+
+
+CODES = {
+    "empty": b"",
+    "an archive": b"PK\x03\x04 and no more",
+    "records": npy(np.zeros(3, [("bit", np.uint8)])),
+    "complex": npy(np.array([0, 1, 1j])),
+}
+
+
+@pytest.mark.parametrize("content", CODES.values(), ids=CODES)
+def test_a_file_without_a_code_is_refused_in_words(cli: Cli, tmp_path: Path, content: bytes) -> None:
+    """Each ended in a traceback of NumPy or zipfile, but for complex numbers."""
+    (tmp_path / "code.npy").write_bytes(content)
+    answer = cli("trigger", "load", str(tmp_path / "code.npy"))
+    assert answer.code == 2, answer.err
+    assert "code.npy" in answer.err
+    assert "Traceback" not in answer.err
+
+
+@pytest.mark.parametrize("out", [".", "/"])
+def test_a_rendering_needs_a_name(cli: Cli, out: str) -> None:
+    """The hint, another suffix for a name that there is not, ended in a traceback."""
+    answer = cli("render", "video.zarr", "--out", out)
+    assert answer.code == 2, answer.err
+    assert f"{out} cannot be rendered: its name has no suffix" in answer.err

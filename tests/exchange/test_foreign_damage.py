@@ -40,6 +40,12 @@ def test_only_a_row_of_real_numbers_is_accepted_as_code_bits(tmp_path: Path, val
         parse_code(f"bits:{path}")
 
 
+def test_a_seed_of_thousands_of_digits_is_refused_in_words() -> None:
+    """Python converts up to 4300 digits; a rig file takes a seed of up to 39."""
+    with pytest.raises(UsageError, match=r"the code .* cannot be read"):
+        parse_code(f"prbs:64:{'7' * 5000}")
+
+
 @pytest.mark.parametrize("compression", ["zlib", "lzma"])
 def test_a_damaged_page_is_an_error_of_the_lines_in_it(tmp_path: Path, compression: str) -> None:
     path = tmp_path / "damaged.tif"

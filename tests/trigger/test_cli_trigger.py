@@ -112,7 +112,7 @@ def test_a_code_is_loaded_from_text_or_array_and_used(port: str, tmp_path) -> No
     armed = json.loads(acquire("arm", "--memory", "--url", port, "--json"))
     assert (armed["state"], armed["code_checked"]) == ("ARMED", True)
     (tmp_path / "bad.txt").write_text("0123")
-    assert "one row of 0 and 1" in acquire("load", str(tmp_path / "bad.txt"), "--url", port, code=2)
+    assert "does not hold bits" in acquire("load", str(tmp_path / "bad.txt"), "--url", port, code=2)
 
 
 @pytest.mark.usefixtures("locks_of_the_host")

@@ -101,6 +101,7 @@ def demo(
     from acquire.evaluate.report import write_report
     from acquire.evaluate.summary import summarise
 
+    # Fails if it was made since the check: nobody else's directory is filled.
     plan.out.mkdir()
     journal = Journal()
     if rig.trigger.driver == "rtl":
@@ -132,6 +133,7 @@ def _headline(page: Path, summary: dict[str, Any]) -> dict[str, Any]:
         ),
         "recording": f"{capture['recording']}, {capture['size_mb']} MB, {capture['condition']}",
         **solvers,
+        # A constant lamp has none.
         "frequencies": ", ".join(
             f"{curve['name']} {curve['measured_hz']} Hz" for curve in best["curves"] if curve["measured_hz"]
         ),

@@ -67,11 +67,13 @@ def analyse(plan: DemoPlan, captured: Captured, rig: RigConfig, journal: Journal
     assert isinstance(scene, LedScene)
     with journal.stage("Save the truth at full resolution"):
         _save_truth(plan.out / "truth.zarr", scene, segment)
+    # In this order: the report's headline quotes the first (`DemoResult`).
     methods = (
         Method("admm", "ADMM (default)", "video.zarr", plan.budget_s),
         Method("twist", "TwIST (the paper's)", "video-twist.zarr", plan.twist_budget_s),
     )
     host = HostWatch()
+    # Between the solvers, so that their own load is not taken for the host's.
     host.look()
     videos = []
     for method in methods:
@@ -166,6 +168,7 @@ def _regions(scene: LedScene, segment: Segment, trusted: slice) -> tuple[Region,
         if not inner.any():
             continue
         set_hz = led.drive.frequency_hz if isinstance(led.drive, SineDrive) else None
+        # A voxel that a shape covers in part has that part of its light.
         regions.append(Region(led.name, inner, curve * float(mask[inner].mean()), set_hz))
     return tuple(regions)
 
@@ -173,6 +176,7 @@ def _regions(scene: LedScene, segment: Segment, trusted: slice) -> tuple[Region,
 def _rig_facts(recording: Recording) -> RigFacts:
     attrs: dict[str, Any] = recording.attrs
     code = attrs["code"]
+    # The start is 0 in every recording.
     text = ", ".join(f"{key} {value}" for key, value in code.items() if key not in {"kind", "start"})
     return RigFacts(
         name=str(attrs["config"]["name"]),

@@ -93,6 +93,7 @@ def daemon(plan: DemoPlan, socket: Path) -> Iterator[subprocess.Popen[bytes]]:
     """Run ``acquire serve`` for the demo."""
     settings = {"code.seed": plan.seed, **trigger_settings(plan)}
     options = [f"--config={plan.config}", f"--socket={socket}"]
+    # --set takes TOML, in which numbers and quoted texts look as in Python.
     options += [f"--set={key}={value!r}" for key, value in settings.items()]
     with daemon_process(options, plan.out / LOG) as process:
         yield process
@@ -121,6 +122,7 @@ def end(process: subprocess.Popen[bytes], timeout_s: float = END_TIMEOUT_S) -> b
     try:
         process.wait(timeout_s)
     except subprocess.TimeoutExpired:
+        # A daemon that hangs would otherwise keep its devices, and its recording unsealed.
         process.kill()
         process.wait()
         return False
@@ -135,6 +137,7 @@ def await_daemon(client: Client, process: subprocess.Popen[bytes], log: Path) ->
             client.status()
         except NoDaemonError:
             if process.poll() is not None:
+                # The error is at the end; the hint names the whole log.
                 last = log.read_text(errors="replace").strip().splitlines()[-3:]
                 raise AcquireError(f"the daemon ended at once: {' '.join(last)}", hint=str(log)) from None
             if time.monotonic() > deadline:

@@ -55,6 +55,7 @@ class DemoPlan:
     @property
     def command(self) -> str:
         """Command line that repeats the run in another directory."""
+        # Without --cameras: these are those of the rig, which `rig_of` has chosen by then.
         words = ["acquire", "demo", "--seed", str(self.seed), "--lines", str(self.lines)]
         if self.config != RIG:
             words += ["--config", self.config]

@@ -37,6 +37,7 @@ def contrasts(picture: NDArray[Any], field_mm: float, groups: tuple[int, ...]) -
 def last_resolved(contrast: dict[str, float]) -> str:
     """Return the finest element up to which all reach `THRESHOLD`; ``–`` if the first does not."""
     last = "–"
+    # As texts, which is their order in size: groups and elements have one digit.
     for name, value in sorted(contrast.items()):
         if value < THRESHOLD:
             break

@@ -63,6 +63,7 @@ def finer(what: str, paper: str, ours: str, elements: int) -> Row:
 
 def in_elements(elements: int) -> str:
     """Describe how much finer or coarser a number of elements is."""
+    # Six elements double the line pairs per mm: these are 2^(group + (element − 1)/6).
     count = abs(elements)
     kind = "finer" if elements >= 0 else "coarser"
     return f"{count} {'element' if count == 1 else 'elements'} {kind}, × {2 ** (count / 6):.2f}"

@@ -48,11 +48,13 @@ def strips(
     """Draw rows of frames as one figure, with at most ``across`` instants side by side."""
     blocks = -(-len(stamps) // (across or len(stamps)))
     across = -(-len(stamps) // blocks)  # distribute the instants evenly over the blocks
+    # Frames are square to the eye: the height of the figure follows from the width of one.
     side_in = (width_in - LABEL_IN) / across
     shape = rows[0][1].shape
     figure = canvas(blocks * (STAMP_IN + side_in * shape[1] / shape[2] * len(rows)), width_in)
     axes = figure.subplots(blocks * len(rows), across, squeeze=False)
     for ax in axes.ravel():
+        # All of them: the last block may have fewer instants than columns.
         bare(ax)
     for number, text in enumerate(stamps):
         block, column = divmod(number, across)
@@ -70,6 +72,7 @@ def box(ax: Axes, rows: slice, columns: slice, colour: str = HIGHLIGHT, width: f
     """Outline a rectangle of pixels."""
     from matplotlib.patches import Rectangle
 
+    # imshow centres a pixel on whole numbers.
     corner = (columns.start - 0.5, rows.start - 0.5)
     size = (columns.stop - columns.start, rows.stop - rows.start)
     ax.add_patch(Rectangle(corner, *size, fill=False, edgecolor=colour, linewidth=width))

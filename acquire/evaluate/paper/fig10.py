@@ -19,7 +19,9 @@ if TYPE_CHECKING:
 
     from acquire.evaluate.paper.studio import Studio
 
+# 52 ms at 33.3 kHz, and 598 trusted frames, as in Fig. 9.
 FIRST_LINE, LINES = 1733, 263
+# The 1.28 ms of a digit, in frames of 10 µs.
 PERIOD_FRAMES = 128
 LIT = 0.4
 """A segment counts as lit at this share of the brightest of its display."""
@@ -54,6 +56,7 @@ def figure(studio: Studio) -> PaperFigure:
     curves = {
         name: (region_mean(video, masks[key]), region_mean(truth, masks[key])) for name, key in BOXES.items()
     }
+    # Four digits of either display.
     picks = np.sort(np.concatenate([peaks["left"], peaks["right"]]))[:8]
     agreement = {name: correlation(*pair) for name, pair in curves.items()}
     return PaperFigure(

@@ -21,7 +21,9 @@ if TYPE_CHECKING:
     from acquire.evaluate.paper.studio import Studio
 
 BEGIN_MS, END_MS, PIECES = 30, 70, 7
+# 70 ms are 2334 lines; the charge of the last frames passes through 64 more.
 LINES = 2420
+# 40 ms in sub-steps of 10 µs.
 FRAMES = 4000
 PAPER_S = 600.0
 """Least time that the paper needs for a segment."""
@@ -93,6 +95,7 @@ def figure(studio: Studio) -> PaperFigure:
         seconds=dict(studio.seconds),
         numbers=numbers,
         # every 32nd frame of 10 µs
+        # Every frame would be 4000 pictures, far more than a page can hold (`player.MAX_BYTES`).
         movie={"ours": video[::32], "truth": truth[::32]},
         movie_ms=0.32,
     )

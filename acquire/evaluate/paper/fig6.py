@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from acquire.store import Recording
 
 LINES, FIRST = 263, 70
+# As in configs/scene-usaf.toml; its groups 4 and 5 are finer than a fine pixel can show.
 GROUPS, FIELD_MM = (2, 3), 6.4
 SHOWN_US = 20.0
 NARROW_STATIC_IN = 2.0
@@ -149,6 +150,7 @@ def figure(studio: Studio) -> PaperFigure:
 
 def in_scene_units(picture: NDArray[Any], recording: Recording) -> NDArray[Any]:
     """Return a still picture in units of the scene, whose light a coarse sensor sums over k³ fine voxels."""
+    # Two axes of the picture and one of time are coarser by this factor.
     coarse = scene_of(recording).size // recording.geometry_for(1).size
     return picture / coarse**3
 
@@ -186,6 +188,7 @@ def _pulses(
     # one voxel as large as the field: only its light over time is of interest
     result = reconstruct(segment, geometry.size, 1, static_image=image)
     level = factor * binned.mean()  # a coarse step collects the light of its fine sub-steps
+    # Lines hold nothing of the light while the code is dark.
     light = np.where(segment.code > 0, result.video[:, 0, 0] / level, np.nan)
     found = light[geometry.trusted]
     first = factor * (geometry.substeps * FIRST + geometry.trusted.start)

@@ -70,6 +70,7 @@ def figure(studio: Studio) -> PaperFigure:
                 "(d) N_m = 3, T_m = 4: the fast fish is sharp, the stripes have lost contrast.",
                 motion,
                 truth=true_motion,
+                # The middles of the five frames above: one of 820 sub-steps is as long as 205 of 4.
                 picks=range(102, 1025, 205),
                 frame_ms=frame_ms[1],
             ),
@@ -126,6 +127,7 @@ def _profiles(
     reach = np.linspace(-PROFILE, PROFILE, 160)
 
     def along(picture: NDArray[Any], angle: float) -> NDArray[np.float64]:
+        # Rows count downwards, so the sine of the angle has a minus.
         place = 0.5 + np.stack([-np.sin(angle) * reach, np.cos(angle) * reach])
         return map_coordinates(picture.astype(np.float64), place * len(picture) - 0.5, order=1)
 

@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from acquire.evaluate.paper.studio import Studio
 
 LINES = 2140
+# The shortest T_m of plan-window, that of #A and #C, sets the frames of the whole video.
 T_OUT = 4
 KEPT = "2136 + 1972 + 2136"
 NARROW_CLOSE_IN = 1.5
@@ -41,10 +42,12 @@ def figure(studio: Studio) -> PaperFigure:
     edges = [part["begin_substep"] // T_OUT for part in outcome.provenance["segments"]] + [len(video)]
     a, b, c = (slice(low, high) for low, high in pairwise(edges))
     numbers = {
+        # #A and #C have voxels of 3 × 3 fine pixels, which the video repeats: one of each is compared.
         "a_psnr_db": psnr(video[a, ::3, ::3], coarse[a], 1.0),
         "b_psnr_db": psnr(video[b], fine[b], 1.0),
         "c_psnr_db": psnr(video[c, ::3, ::3], coarse[c], 1.0),
     }
+    # The window is open in #B: all its frames show the same.
     still = video[b].mean(axis=0)
     resolved = last_resolved(contrasts(still, FIELD_MM, GROUPS))
     # the truth in voxels of N_m = 3, which #A and #C cannot surpass

@@ -107,6 +107,7 @@ def figure_of(recording: Recording, studio: Studio, first_line: int | None = Non
         ),
         seconds=dict(studio.seconds),
         numbers={f"{lamp.place}_hz": lamp.fit.frequency_hz for lamp in lamps},
+        # The page shows 1 as white.
         movie={"reconstructed": video[::4] / white},
         movie_ms=4 * interval_s * 1e3,
     )
@@ -127,6 +128,7 @@ def _lamps(video: NDArray[np.float64], interval_s: float) -> Iterator[Lamp]:
         if fit.amplitude < STEADY * fit.offset:
             fit = fit_constant(light)
         # a fitted constant has frequency 0, to which only the constant lamp is near
+        # At most one: the lamps' frequencies differ by factors of 2 and more.
         near = (name for name, hz in LAMPS.items() if abs(fit.frequency_hz - hz) <= NEAR * hz)
         yield Lamp(place, light, fit, next(near, None))
 

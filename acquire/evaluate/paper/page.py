@@ -89,6 +89,7 @@ def write_page(
         "solver": studio.options.solver,
         "preset": studio.options.preset,
         "budget_s": studio.options.budget_s,
+        # Also those that no row has: summary.json has the same keys for every choice of figures.
         "verdicts": {verdict: found[verdict] for verdict in get_args(Verdict)},
         "figures": [each.facts for each in figures],
     }

@@ -132,6 +132,7 @@ class Studio:
         if gain_dn_per_e is not None:
             noise = (ShotNoise(kind="shot_noise"), ReadNoise(kind="read_noise", sigma_e=READ_NOISE_E))
             scene = scene.model_copy(update={"effects": noise, "system_gain_dn_per_e": gain_dn_per_e})
+        # The seed of the studio, so that `acquire paper --seed` repeats all figures with another code.
         rig = load_rig(scene.rig, {"code.seed": self.seed})
         path = self.directory / f"{name}.zarr"
         simulate(rig, scene, path, lines)
@@ -186,6 +187,7 @@ class Studio:
     ) -> Outcome:
         """Reconstruct a selection in ``pieces`` equal sub-segments."""
         begin, end = selection.extent(voxels, voxels, whole=False)
+        # Rounded up: pieces that are a sub-step shorter would leave one more.
         request = in_voxels(selection, voxels, longest=-(-(end - begin) // pieces))
         return self._combine(recording, request, f"{what.split(maxsplit=1)[0]}-video.zarr", what)
 
@@ -206,6 +208,7 @@ class Studio:
         return outcome
 
     def _begin(self, what: str) -> None:
+        # Before and after, but not during the work: a look takes a core for hundredths of a second.
         self.host.look()
         self.say(f"reconstructing {what}")
 
