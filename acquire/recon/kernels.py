@@ -1,4 +1,4 @@
-"""Compiled loops of the isotropic 2-D total-variation prox, frame by frame or with edges in common.
+"""Compiled loops of the solvers, above all the isotropic 2-D total-variation prox.
 
     prox(b) = argmin_x ½‖x − b‖² + λ·TV(x),    TV(x) = Σ √((x_{r+1,c} − x_{r,c})² + (x_{r,c+1} − x_{r,c})²)
 
@@ -9,6 +9,8 @@ versions are several times slower (tools/bench_tv.py).
 
 Frames k with edges in common have the prox of Σ √(Σ_k λ_k²·|∇x_k|²) (vectorial total variation, Bresson and
 Chan, Inverse Probl. Imaging 2, 455 (2008)): x_k = b_k + λ_k·div(p_k, q_k), Σ_k |(p_k, q_k)|² ≤ 1.
+
+Also those of the prox in three dimensions (`volume`) and of the split of the sign (`sign`).
 """
 
 from __future__ import annotations
