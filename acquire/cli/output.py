@@ -32,14 +32,26 @@ _IN_JSON = re.compile(r"[^ -~\n]")
 
 def say(text: str = "", *, err: bool = False) -> None:
     """Print one line. A stderr that takes nothing (a closed pipe, a full disk) does not end the work."""
-    with contextlib.suppress(*(OSError,) if err else ()):
-        typer.echo(visible(text), err=err)
+    if not err:
+        _write(visible(text))
+        return
+    with contextlib.suppress(OSError):
+        typer.echo(visible(text), err=True)
 
 
 def print_json(value: Any) -> None:
     """Print one JSON document; values of other types are written as text."""
     # Not by `say`, which would escape the line breaks of the document.
-    typer.echo(json_text(value, indent=2))
+    _write(json_text(value, indent=2))
+
+
+def _write(text: str) -> None:
+    try:
+        typer.echo(text)
+    except OSError as error:
+        # An error of a stream names none, and then no user knows what is full.
+        error.filename = "standard output"
+        raise
 
 
 def json_text(value: Any, indent: int | None = None) -> str:

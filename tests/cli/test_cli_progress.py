@@ -171,6 +171,7 @@ def test_a_program_s_order_to_end_is_like_ctrl_c(number: signal.Signals) -> None
     """`timeout`, a batch system, a terminal that is closed: what was begun is put in order."""
     code = f"""
 import signal, time
+signal.signal(signal.SIGHUP, signal.SIG_DFL)  # nohup may have run these tests
 from acquire.cli import interrupts
 def end_by():
     try:

@@ -8,6 +8,7 @@ import pty
 import re
 import signal
 import subprocess
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -138,6 +139,8 @@ def test_a_step_that_is_ended_leaves_the_light_s_code_on(tmp_path: Path, number:
             stderr=child,
             cwd=tmp_path,
             env=os.environ | {"ACQUIRE_SOCKET": str(daemon.socket)},
+            # nohup may have run these tests
+            preexec_fn=partial(signal.signal, signal.SIGHUP, signal.SIG_DFL),  # noqa: PLW1509 - one system call
         ) as step:
             os.close(child)
             until(lambda: client.status().state == "recording")
