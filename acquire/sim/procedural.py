@@ -14,6 +14,9 @@
     leds_dot  the same, and a dot that moves
     fastled   lamps of 20 kHz and 1 kHz
     still     a textured still
+    fan       blades turn before a textured still
+    string    a string vibrates, with an overtone
+    piston    a crank moves a piston
 
 Sizes are fractions of the picture and times fractions of the span, so that a scene is the same at any M, S
 and L_R; only the lamps have frequencies in sub-steps. The noise is that of a 12-bit camera whose brightest
@@ -285,6 +288,45 @@ def still(s: Stage) -> Callable[[int, float], Image]:
     return lambda _t, _tau: image
 
 
+def fan(s: Stage) -> Callable[[int, float], Image]:
+    far, angle, start = np.hypot(s.y - 0.5, s.x - 0.5), np.arctan2(s.y - 0.5, s.x - 0.5), s.rng.uniform(0, 6)
+    blades, rate = int(s.rng.integers(3, 6)), s.rng.uniform(5, 15)
+    hub = s.inside(far - 0.38)
+
+    def frame(_t: int, tau: float) -> Image:
+        across = np.sin(blades * (angle + start) - 2 * np.pi * rate * tau) * far / blades  # of an edge
+        return _over(0.8 * s.ground, s.inside(-across) * hub, 0.1)
+
+    return frame
+
+
+def string(s: Stage) -> Callable[[int, float], Image]:
+    rate, swing = s.rng.uniform(3, 12), s.rng.uniform(0.04, 0.1)
+
+    def frame(_t: int, tau: float) -> Image:
+        phase = 2 * np.pi * rate * tau
+        y = (
+            0.5
+            + swing * np.sin(np.pi * s.x) * np.sin(phase)
+            + 0.04 * np.sin(2 * np.pi * s.x) * np.sin(2 * phase)
+        )
+        return np.asarray(0.05 + 0.9 * s.inside(abs(s.y - y) - 0.03), np.float32)
+
+    return frame
+
+
+def piston(s: Stage) -> Callable[[int, float], Image]:
+    rate, (y, x), crank, rod = s.rng.uniform(2.5, 10), (0.6, 0.3), 0.13, 0.45
+
+    def frame(_t: int, tau: float) -> Image:
+        up, along = crank * np.sin(2 * np.pi * rate * tau), crank * np.cos(2 * np.pi * rate * tau)
+        image = _over(np.full_like(s.x, 0.1), s.ball(y, x, 0.2), 0.5)
+        image = _over(image, s.ball(y + up, x + along, 0.05), 0.95)
+        return _over(image, s.box(y, x + along + np.sqrt(rod**2 - up**2), 0.16, 0.14), 0.8).astype(np.float32)
+
+    return frame
+
+
 SCENES = {
     f.__name__: f
     for f in (
@@ -302,6 +344,9 @@ SCENES = {
         leds_dot,
         fastled,
         still,
+        fan,
+        string,
+        piston,
     )
 }
 
