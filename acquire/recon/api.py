@@ -15,6 +15,7 @@ from acquire.lines import Segment
 from acquire.recon.aliasing import detect_unresolved_light, name_gaps
 from acquire.recon.balance import balance_of, divided
 from acquire.recon.clock import IterationClock
+from acquire.recon.cycle import describe_cycle
 from acquire.recon.denoisers import open_denoiser
 from acquire.recon.description_check import DescriptionCheck, check_description
 from acquire.recon.error_estimation import RESERVED_ITERATIONS, estimate_error
@@ -232,6 +233,8 @@ class _Run:
                 segment, problem, estimate, clock, video=video, quality=quality, merges=merges, cut=cut
             )
         warnings = judge(segment, problem, quality, trusted)
+        if period_frames := facts.get("period_frames"):
+            warnings = (*warnings, describe_cycle(period_frames, segment.substep_ns * T_m))
         return Reconstruction(
             video=video,
             time_ns=segment.frame_time_ns(T_m),

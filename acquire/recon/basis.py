@@ -2,11 +2,13 @@
 
 A video of T frames whose coefficients beyond K are 0 is band-limited to K/(2T) of the frame rate. Working
 with K coefficient frames instead of T frames makes the solvers fast. If a scene is a few patterns with a
-curve each, a `LearnedBasis` of these curves, which are combinations of the cosines, is smaller still.
+curve each, a `LearnedBasis` of these curves, which are combinations of the cosines, is smaller still. Motion
+that repeats has a `CyclicBasis`, the harmonics of its period.
 """
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
@@ -128,6 +130,63 @@ class LearnedBasis:
     def analyze(self, video: Array) -> Array:
         """θ = D·x: (T, …) → (R, …)."""
         return _product(self.arrays, self.curves.T, self._within.analyze(video))
+
+
+class CyclicBasis:
+    """The constant and H harmonics of a period, a cosine and a sine of each: rows D (2H + 1, T).
+
+    Phases count from the middle of the span, so that a slightly longer period moves both ends alike. In a
+    span that is no whole number of periods the harmonics are slightly oblique: D is the orthonormal set that
+    is closest to them (Löwdin, J. Chem. Phys. 18, 365 (1950)).
+
+    Raises UsageError if the period is not positive, or if the frames are too few for its harmonics.
+    """
+
+    def __init__(self, frames: int, harmonics: int, period_frames: float, arrays: Arrays = HOST) -> None:
+        if not (period_frames > 0 and harmonics >= 0 and 2 * harmonics < min(frames, period_frames + 1)):
+            raise UsageError(
+                f"{frames} frames do not show {harmonics} harmonics of a period of {period_frames:g} frames",
+                possible="fewer than half as many harmonics as frames of a period",
+            )
+        self.frames, self.harmonics, self.arrays = frames, harmonics, arrays
+        self.period_frames = period_frames
+        self.count = 2 * harmonics + 1
+        # cosine k of the span is k/2 cycles in it
+        self.cosines = min(frames, math.ceil(2 * harmonics * frames / period_frames) + 1)
+        self.held = np.arange(self.cosines)
+        oblique = self._oblique(frames)
+        energies, axes = np.linalg.eigh(oblique @ oblique.T)
+        self._straighten = axes @ np.diag(energies**-0.5) @ axes.T
+
+    def matrix(self, grid: int | None = None) -> NDArray[Any]:
+        """D (2H + 1, grid) at equidistant instants of the span (default: the frames)."""
+        matrix: NDArray[Any] = (self._straighten @ self._oblique(grid or self.frames)).astype(
+            self.arrays.dtype
+        )
+        return matrix
+
+    def _oblique(self, points: int) -> NDArray[np.float64]:
+        """The harmonics at this many instants, scaled to a norm of about 1."""
+        cycles = self.frames / self.period_frames * ((np.arange(points) + 0.5) / points - 0.5)
+        angle = 2 * np.pi * np.arange(1, self.harmonics + 1)[:, None] * cycles
+        pairs = np.stack([np.cos(angle), np.sin(angle)], axis=1).reshape(-1, points)
+        rows: NDArray[np.float64] = np.concatenate(
+            [np.full((1, points), points**-0.5), (2 / points) ** 0.5 * pairs]
+        )
+        return rows
+
+    def spread(self, theta: Array) -> Array:
+        """Coefficients of the cosines: (2H + 1, …) → (cosines, …)."""
+        within = TemporalBasis(self.frames, self.cosines, self.arrays).matrix()
+        return _product(self.arrays, within @ self.matrix().T, theta)
+
+    def synthesize(self, theta: Array) -> Array:
+        """x = Dᵀ·θ: (2H + 1, …) → (T, …)."""
+        return _product(self.arrays, self.matrix().T, theta)
+
+    def analyze(self, video: Array) -> Array:
+        """θ = D·x: (T, …) → (2H + 1, …)."""
+        return _product(self.arrays, self.matrix(), video)
 
 
 def _product(arrays: Arrays, matrix: NDArray[Any], frames: Array) -> Array:

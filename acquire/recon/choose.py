@@ -2,6 +2,7 @@
 
     still      one frame, total variation                         for rest, or light too weak for more
     volume     few cosines, total variation of a volume           for motion; also times a free brightness
+    cycle      harmonics of a period, total variation of a cycle  for motion that repeats
     smooth     few cosines, quadratic in second differences       for flow
     cosines    the whole band, total variation of coefficients    for lamps, then as patterns and curves
 
@@ -31,23 +32,15 @@ from acquire.recon.blinking import (
     refine,
     solve_in_cosines,
 )
+from acquire.recon.candidates import CALM, SMOOTH, STILL, VOLUME
+from acquire.recon.cycle import find_period
 from acquire.recon.estimates import Preferred, Refined
 from acquire.recon.holdout import HeldOut
 from acquire.recon.patterns import find_patterns
 from acquire.recon.reuse import reuse_choice
 from acquire.recon.solver import Preset, Solver
 from acquire.recon.still import best_still, change_bench, weighted_like
-from acquire.recon.workbench import (
-    BRIGHTER,
-    CALM,
-    FIRST_ITERATIONS,
-    LEAST_GAIN,
-    SEARCH_SHARE,
-    SMOOTH,
-    STILL,
-    VOLUME,
-    Workbench,
-)
+from acquire.recon.workbench import BRIGHTER, FIRST_ITERATIONS, LEAST_GAIN, SEARCH_SHARE, Workbench
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -72,6 +65,10 @@ admits more noise that does not show."""
 CLEARLY = 0.97
 """Largest error of a volume, relative to a still's, for which it is preferred; the change from a still equals
 the still where its prior is strong, and need only be better."""
+REPEATS = 0.8
+"""Largest error of a cycle, relative to the volume's, the still's and the cosines' at a glance, for which it
+is a candidate: a video that repeats itself claims more than any other. Motion that repeats has 0.4 to 0.7,
+text that scrolls 0.9."""
 CLOSE, DOUBTFUL = 1.1, 2.0
 """Largest error of the cosines, relative to the best trial's, for which they are continued, and for which
 they are if clear patterns were found, or if only a glance was taken."""
@@ -139,6 +136,11 @@ def _choose(
         # the first cosine is constant, so that this is the video's mean over time
         picture = (cosines.basis.matrix()[0, 0] * host(cosines.solver.theta[0, ...])).clip(0)
         tried.bright = bench.brighten(picture, cosines.basis.cosines, min(at_a_glance, tried.best.error))
+        period = find_period(cosines.solver.theta, cosines.basis)
+        if period is not None and not clock.spent(SEARCH_SHARE):
+            rival = min(at_a_glance, tried.best.error)
+            cycle = bench.repeat(period, rival)
+            tried.cycle = cycle if cycle.error < REPEATS * rival else None
     ahead, refined = at_a_glance <= OUTDONE * tried.best.error, None
     if ahead:
         complete_look(cosines, options, clock)
@@ -159,17 +161,18 @@ def _choose(
 
 @dataclass
 class _Tried:
-    """First trials: a volume, a still and, unless patterns are clear, a smooth volume and one of changing
-    brightness (None if the brightness is steady)."""
+    """First trials: a volume, a still and, unless patterns are clear, a smooth volume, one of changing
+    brightness (None if the brightness is steady) and a cycle (None if nothing repeats)."""
 
     volume: Trial
     plain: Trial
     smooth: Trial | None = None
     bright: Trial | None = None
+    cycle: Trial | None = None
 
     @property
     def best(self) -> Trial:
-        trials = (self.volume, self.plain, self.smooth, self.bright)
+        trials = (self.volume, self.plain, self.smooth, self.bright, self.cycle)
         return min((trial for trial in trials if trial is not None), key=_error)
 
 
@@ -194,7 +197,7 @@ def _search(bench: Workbench, tried: _Tried, trials: int, rival: float) -> Trial
     plain = still = tried.plain
     calm = bench.attempt(bench.fitting(CALM), FIRST_ITERATIONS, plain)
     smooth = tried.smooth or bench.attempt(bench.fitting(SMOOTH), FIRST_ITERATIONS)
-    volume = min((tried.volume, calm), key=_error)
+    volume = min((each for each in (tried.volume, calm, tried.cycle) if each is not None), key=_error)
     bright = tried.bright
     # to a brightness, a flash in front of a still is the flash of everything
     flickers = bright is not None and bench.held_out.clearly_less(bright.errors, plain.errors)
@@ -213,6 +216,8 @@ def _search(bench: Workbench, tried: _Tried, trials: int, rival: float) -> Trial
         volume = volume.bench.climb(volume, trials)
         if volume.candidate.brightness:
             volume = volume.bench.follow_brightness(volume)
+        if volume.candidate.period_frames:
+            volume = volume.bench.follow_period(volume)
     if smooth.error < FAR * min(volume.error, rival):
         smooth = bench.climb(smooth, trials)
     # beyond chance, which is worth 5 dB where something flashes; not required of other volumes, since ten

@@ -210,15 +210,18 @@ def _volume_prox(
     volume: NDArray[Any],
     weight: float,
     pace: float,
+    cyclic: bool,
     dual: NDArray[Any],
     iterations: int,
     out: NDArray[Any],
 ) -> None:
     """out = prox of weight·TV₃ at the volume (t, r, c); dual (3, t, r, c) is updated.
 
-    TV₃(x) = Σ √(|∇x|² + (pace·∂x/∂t)²): the gradient's norm is at most √(8 + 4·pace²).
+    TV₃(x) = Σ √(|∇x|² + (pace·∂x/∂t)²): the gradient's norm is at most √(8 + 4·pace²). In a ``cyclic``
+    volume the first instant follows the last one.
     """
     instants = volume.shape[0]
+    after_last = 0 if cyclic else instants - 1
     ahead = dual.copy()
     momentum = 1.0
     step = volume.dtype.type(1 / ((8 + 4 * pace * pace) * weight))
@@ -228,7 +231,8 @@ def _volume_prox(
         following = (1 + np.sqrt(1 + 4 * momentum * momentum)) / 2
         push = volume.dtype.type((momentum - 1) / following)
         for t in numba.prange(instants):
-            _volume_dual_step(out, t, step, pace, push, dual, ahead)
+            after = t + 1 if t + 1 < instants else after_last
+            _volume_dual_step(out, t, after, step, pace, push, dual, ahead)
         momentum = following
     for t in numba.prange(instants):
         _volume_primal(volume, dual, t, weight, pace, out[t])
@@ -242,31 +246,33 @@ def _volume_primal(
     _primal(b[t], dual[0, t], dual[1, t], weight, x)
     w = x.dtype.type(weight * pace)
     rows, columns = x.shape
-    before = dual[2, max(t - 1, 0)]
+    # at the first instant, the last one's: the difference across the ends of a cycle, otherwise 0
+    before = dual[2, t - 1]
     for r in range(rows):
         for c in range(columns):
-            x[r, c] += w * dual[2, t, r, c]
-        if t > 0:
-            for c in range(columns):
-                x[r, c] -= w * before[r, c]
+            x[r, c] += w * (dual[2, t, r, c] - before[r, c])
 
 
 @numba.njit(cache=True, fastmath=_FAST)
 def _volume_dual_step(
     x: NDArray[Any],
     t: int,
+    after: int,
     step: float,
     pace: float,
     push: float,
     dual: NDArray[Any],
     ahead: NDArray[Any],
 ) -> None:
-    """One projected step from the point ahead, as `_dual_step` in three dimensions."""
-    instants, rows, columns = x.shape
+    """One projected step from the point ahead, as `_dual_step` in three dimensions.
+
+    ``after`` is the instant that follows ``t``: ``t`` itself where none does.
+    """
+    _, rows, columns = x.shape
     one, slow = x.dtype.type(1), x.dtype.type(step * pace)
     for r in range(rows):
-        # in the last row and instant the neighbour is the voxel itself: a difference of 0
-        here, below, later = x[t, r], x[t, min(r + 1, rows - 1)], x[min(t + 1, instants - 1), r]
+        # where there is no neighbour, it is the voxel itself: a difference of 0
+        here, below, later = x[t, r], x[t, min(r + 1, rows - 1)], x[after, r]
         p, q, s = dual[0, t, r], dual[1, t, r], dual[2, t, r]
         p_ahead, q_ahead, s_ahead = ahead[0, t, r], ahead[1, t, r], ahead[2, t, r]
         for c in range(columns - 1):

@@ -14,18 +14,11 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, Self
 
 from acquire.recon.blinking import EXPLAINED, first_look, refine
+from acquire.recon.candidates import LARGEST_WEIGHT, STILL, WEIGHT_STEP, Candidate, rounded
+from acquire.recon.cycle import FEWEST_CYCLES
 from acquire.recon.estimates import Preferred
 from acquire.recon.result import EXPLAINED as EXPLAINED_NOISE
-from acquire.recon.workbench import (
-    FIRST_ITERATIONS,
-    LARGEST_WEIGHT,
-    NEXT_ITERATIONS,
-    SEARCH_SHARE,
-    STILL,
-    WEIGHT_STEP,
-    Candidate,
-    rounded,
-)
+from acquire.recon.workbench import FIRST_ITERATIONS, NEXT_ITERATIONS, SEARCH_SHARE
 
 if TYPE_CHECKING:
     from acquire.lines import Segment
@@ -46,7 +39,8 @@ class Choice:
     """What was chosen, and how well it predicted: ``error`` and ``noise`` are relative to the samples.
 
     ``prior`` is that of a candidate, or `COSINES`, of which only the number is handed over. ``brightness`` is
-    the number of cosines of the whole scene's brightness, 0 if that is constant.
+    the number of cosines of the whole scene's brightness, 0 if that is constant, ``period_frames`` that of a
+    cycle, which the next part fits to its own lines.
     """
 
     prior: str
@@ -57,6 +51,7 @@ class Choice:
     noise: float
     brightness: int = 0
     fine: bool = False
+    period_frames: float = 0.0
 
     @classmethod
     def of(cls, result: Reconstruction) -> Self | None:
@@ -66,16 +61,18 @@ class Choice:
         if "candidates" not in found or found.get("robust") or found.get("change"):
             return None
         counts = [each["temporal_coefficients"] for each in found["candidates"] if each["prior"] == COSINES]
-        in_cosines = found["prior"] == COSINES
+        in_cosines, cyclic = found["prior"] == COSINES, "harmonics" in found
         return cls(
             prior=found["prior"],
-            coefficients=found["temporal_coefficients"],
+            # of a cycle, the cosines up to its fastest harmonic are not what is solved for
+            coefficients=2 * found["harmonics"] + 1 if cyclic else found["temporal_coefficients"],
             weight=0.0 if in_cosines else found["weight"],
             pace=0.0 if in_cosines else found["pace"],
             error=quality.prediction,
             noise=quality.noise,
             brightness=counts[0] if found.get("brightness") and counts else 0,
             fine=bool(found.get("fine")),
+            period_frames=found.get("period_frames", 0.0),
         )
 
     def fits(self, error: float, noise: float) -> bool:
@@ -98,7 +95,8 @@ class Choice:
         """The candidate to try on this many frames."""
         cosines = min(self.coefficients, frames)
         bright, fine = bool(self.brightness), self.fine
-        return Candidate(self.prior, cosines, self.weight, self.pace, bright, fine=fine)  # type: ignore[arg-type]  # not cosines
+        known = {"brightness": bright, "fine": fine, "period_frames": self.period_frames}
+        return Candidate(self.prior, cosines, self.weight, self.pace, **known)  # type: ignore[arg-type]  # not cosines
 
 
 def reuse_choice(bench: Workbench, segment: Segment, options: SolveOptions, trials: int) -> Estimate | None:
@@ -119,12 +117,18 @@ def reuse_choice(bench: Workbench, segment: Segment, options: SolveOptions, tria
         return bench.finish(still.bench.climb(still, trials)) if frames == 1 else None
     if choice.prior == COSINES:
         return _in_cosines(bench, still, segment, options)
+    if choice.period_frames * FEWEST_CYCLES > frames:
+        return None
     bright = None
     if choice.brightness:
         bright = bench.brighten(bench.video(still)[0].clip(0), choice.brightness, still.error)
         if bright is None or not bright.error < still.error:
             return None
     moving = bench.attempt(choice.candidate(frames), FIRST_ITERATIONS, bright)
+    if choice.period_frames:
+        # what was handed over had more iterations
+        moving = bench.follow_period(moving)
+        moving = bench.attempt(moving.candidate, NEXT_ITERATIONS, moving)
     best = moving if bench.held_out.clearly_less(moving.errors, still.errors) else still
     return bench.finish(_strengthened(best)) if choice.fits(best.error, noise) else None
 

@@ -93,7 +93,9 @@ class SignSplit:
         self._scale, self._pulled = self._scale * factor, None
 
     def resume(self, other: SignSplit) -> None:
-        """Take over the state of another split with as many instants."""
+        """Take over the state of another split, unless it has another number of instants."""
+        if other._signed.shape != self._signed.shape:
+            return
         self._signed, self._scale = self._xp.asarray(other._signed, copy=True), other._scale
         self._pulled = None
 

@@ -11,10 +11,12 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
-from acquire.recon.workbench import FIRST_ITERATIONS, NEXT_ITERATIONS, SEARCH_SHARE, STILL, rounded
+from acquire.recon.candidates import STILL, rounded
+from acquire.recon.workbench import FIRST_ITERATIONS, NEXT_ITERATIONS, SEARCH_SHARE
 
 if TYPE_CHECKING:
-    from acquire.recon.workbench import Candidate, Trial, Workbench
+    from acquire.recon.candidates import Candidate
+    from acquire.recon.workbench import Trial, Workbench
 
 FINER_WEIGHT = 2
 """Power of N_m with which a still's weight grows when its voxels become pixels: its edges become N_m times as

@@ -5,7 +5,8 @@
 over as many instants as there are cosines. An edge that moves is one surface in that volume and costs no more
 than one at rest, although all its coefficients are large; light that blinks in place costs twice its contrast
 in every period. So it suits moving objects, and coefficient frames (`tv.FrameTv`) suit those that blink.
-``pace`` is μ: the higher it is, the less a scene may change.
+``pace`` is μ: the higher it is, the less a scene may change. Of motion that repeats, the volume is one cycle,
+whose end meets its beginning.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ from array_api_compat import is_numpy_array
 
 from acquire.arrays import Arrays, namespace
 from acquire.errors import UsageError
-from acquire.recon.basis import TemporalBasis
+from acquire.recon.basis import CyclicBasis, TemporalBasis
 from acquire.recon.kernels import SMALLEST_WEIGHT, volume_prox, volume_prox_parallel
 from acquire.recon.tv import ahead, layer
 
@@ -32,19 +33,20 @@ PARALLEL_VOXELS = 1 << 20
 class VolumeTv:
     """Isotropic 3-D TV of the first K cosines' volume on K instants, as a denoiser of their coefficients.
 
+    If it is ``cyclic``, the coefficients are those of a `CyclicBasis`, and the instants those of one cycle.
     The transform between coefficients and instants is orthonormal, so that the prox of one is the prox of the
     other. ``prox`` is approximate: ``iterations`` of fast gradient projection (Beck and Teboulle, IEEE
     Trans. Image Process. 18, 2419 (2009)) from where the last call ended.
     """
 
-    def __init__(self, pace: float = 1.0, iterations: int = 6) -> None:
+    def __init__(self, pace: float = 1.0, iterations: int = 6, *, cyclic: bool = False) -> None:
         if not 0 <= pace < math.inf:
             raise UsageError(
                 f"a volume's total variation cannot have pace {pace}", possible="a number of at least 0"
             )
         if iterations < 1:
             raise UsageError(f"the TV prox cannot have {iterations} iterations", possible="1 or more")
-        self.pace, self.iterations = pace, iterations
+        self.pace, self.iterations, self.cyclic = pace, iterations, cyclic
         self._dual: Array = None
         self._instants: Array = None
 
@@ -62,13 +64,18 @@ class VolumeTv:
             self._dual = xp.stack([xp.zeros_like(frames)] * 3)
             count = frames.shape[0]
             # computed in float64, so that frames of float64 do not get cosines that are rounded to float32
-            matrix = TemporalBasis(count, count, Arrays(dtype="float64")).matrix()
+            exact = Arrays(dtype="float64")
+            matrix = (
+                CyclicBasis(count, count // 2, count, exact)
+                if self.cyclic
+                else TemporalBasis(count, count, exact)
+            ).matrix()
             self._instants = xp.asarray(matrix, dtype=frames.dtype, device=frames.device)
         volume = xp.tensordot(self._instants.T, frames, axes=1)
         if is_numpy_array(volume):
             cleaned = np.empty_like(volume)
             clean = volume_prox if volume.size < PARALLEL_VOXELS else volume_prox_parallel
-            clean(volume, weight, self.pace, self._dual, self.iterations, cleaned)
+            clean(volume, weight, self.pace, self.cyclic, self._dual, self.iterations, cleaned)
         else:
             cleaned = self._prox_of_any(volume, weight)
         return xp.tensordot(self._instants, cleaned, axes=1)
@@ -79,14 +86,29 @@ class VolumeTv:
         step, momentum = 1 / ((8 + 4 * self.pace**2) * weight), 1.0
         dual, leading = self._dual, self._dual
         for _ in range(self.iterations):
-            x = volume + weight * _divergence(leading, scales)
-            new = leading + step * xp.stack([k * ahead(x, axis) for axis, k in _axes(scales)])
+            x = volume + weight * self._divergence(leading, scales)
+            gradient = [k * ahead(x, axis) for axis, k in _axes(scales)]
+            if self.cyclic:
+                gradient[-1] = self.pace * (xp.roll(x, -1, axis=0) - x)
+            new = leading + step * xp.stack(gradient)
             new = new / xp.maximum(xp.sqrt(xp.sum(new**2, axis=0)), 1)
             following = (1 + math.sqrt(1 + 4 * momentum**2)) / 2
             leading = new + ((momentum - 1) / following) * (new - dual)
             dual, momentum = new, following
         self._dual = dual
-        return volume + weight * _divergence(dual, scales)
+        return volume + weight * self._divergence(dual, scales)
+
+    def _divergence(self, dual: Array, scales: tuple[float, float, float]) -> Array:
+        """The negative transpose of the scaled differences, for a dual that is 0 at its ends."""
+        xp, total = namespace(dual), 0.0
+        for index, (axis, scale) in enumerate(_axes(scales)):
+            part = dual[index, ...]
+            # the last instant of a cycle has a difference, to the first one
+            before = (
+                part[layer(axis, -1)] if self.cyclic and axis == 0 else xp.zeros_like(part[layer(axis, 0)])
+            )
+            total = total + scale * xp.diff(part, axis=axis, prepend=before)
+        return total
 
 
 def _one(weight: float | Array) -> float:
@@ -97,16 +119,6 @@ def _one(weight: float | Array) -> float:
 def _axes(scales: tuple[float, float, float]) -> tuple[tuple[int, float], ...]:
     """Axes of a volume (t, row, column) in the order of the dual's parts, with their scales."""
     return tuple(zip((1, 2, 0), scales, strict=True))
-
-
-def _divergence(dual: Array, scales: tuple[float, float, float]) -> Array:
-    """The negative transpose of the scaled differences, for a dual that is 0 at its ends."""
-    xp, total = namespace(dual), 0.0
-    for index, (axis, scale) in enumerate(_axes(scales)):
-        part = dual[index, ...]
-        none = xp.zeros_like(part[layer(axis, 0)])
-        total = total + scale * xp.diff(part, axis=axis, prepend=none)
-    return total
 
 
 class Smooth:

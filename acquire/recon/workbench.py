@@ -9,26 +9,26 @@ from __future__ import annotations
 
 from dataclasses import asdict, dataclass, field, replace
 from functools import partial
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from acquire.arrays import host
 from acquire.forward import merge_video
-from acquire.recon.admm import Admm, AdmmParameters
+from acquire.recon.admm import Admm
 from acquire.recon.band import band_operator
-from acquire.recon.basis import TemporalBasis, resized
+from acquire.recon.basis import CyclicBasis, TemporalBasis, resized
 from acquire.recon.brightness import fit_brightness
-from acquire.recon.tv import FrameTv
-from acquire.recon.volume import Smooth, VolumeTv
+from acquire.recon.candidates import CALM, CYCLE, USUAL_ENERGY, VOLUME, Candidate, parameters
+from acquire.recon.cycle import FEWEST_HARMONICS, better_period
+from acquire.recon.volume import VolumeTv
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
-
     from numpy.typing import NDArray
 
     from acquire.arrays import Array
     from acquire.lines import Segment
+    from acquire.recon.basis import Basis
     from acquire.recon.clock import IterationClock
     from acquire.recon.denoisers import Denoiser
     from acquire.recon.holdout import HeldOut
@@ -41,12 +41,6 @@ LAST_ITERATIONS = 15
 """Number of final iterations of the best candidate, with all samples."""
 SEARCH_SHARE = 0.6
 """Upper limit on the search's share of the budget."""
-STILL_STEPS, STILL_SHARE = 60, 0.02
-"""Largest number of gradient steps for a still, and the share of the residual at which they end."""
-COSINES = (8, 12, 16, 24, 36, 54)
-LEAST_PACE, LARGEST_PACE = 0.25, 64.0
-LEAST_WEIGHT, LARGEST_WEIGHT = 1e-7, 1e3
-WEIGHT_STEP, PACE_STEP = 10**0.5, 4.0
 LEAST_GAIN = 0.02
 """Relative gain of the prediction that a weaker prior needs to be preferred; a stronger one needs none."""
 BRIGHT_ROUNDS = 8
@@ -60,64 +54,19 @@ better."""
 BRIGHTER = 0.9
 """Largest error of a volume of changing brightness, relative to that of a constant one, for which it is
 preferred."""
+PERIOD_ROUNDS, LONG_STRIDE = 6, 4.0
+"""Largest number of fits of a period, in turn with its cycle, and how much farther than the fit says it is
+moved at first: a cycle adapts to a wrong period, which then looks nearly right."""
+NEARLY_REPEATS = 1.3
+"""Largest error of a cycle, relative to a rival's, for which its period is fitted: a tenth of a cycle too
+many makes 0.8 out of 0.6, and sometimes 1.15."""
+PARTS = (3, 2, 2)
+"""Parts of a period that are tried, one after the other."""
 PROBE, HOPELESS = 10, 2.5
 """Number of iterations after which a trial ends whose error is this many times that of a rival: the cosines'
 lead is 4 and more for lamps, and 1.3 to 2 for a flame or a scene that flickers as a whole."""
 STEADY = 0.03
 """Standard deviation of a brightness that is left to the other priors."""
-USUAL_FRAMES, USUAL_ENERGY = 980, 7.1e-3
-"""Number of frames and response to a voxel in Fig. 9, for which the candidates' weights are given."""
-
-
-@dataclass(frozen=True, slots=True)
-class Candidate:
-    """A prior and its parameters: K cosines, weight λ, pace μ (scale of a volume's time axis).
-
-    ``brightness``: times a free brightness of the whole scene; ``change``: the difference from the best
-    still; ``fine``: solved at N_m = 1, then merged; ``robust``: samples with large residuals have less
-    weight.
-    """
-
-    prior: Literal["still", "smooth", "volume"]
-    coefficients: int
-    weight: float
-    pace: float = 0.0
-    brightness: bool = False
-    change: bool = False
-    fine: bool = False
-    robust: bool = False
-
-    def denoiser(self) -> Denoiser:
-        """The denoiser of this prior."""
-        if self.prior == "still":
-            return FrameTv(10)
-        return VolumeTv(self.pace) if self.prior == "volume" else Smooth(self.pace)
-
-    def is_stronger_than(self, other: Candidate) -> bool:
-        """Whether it leaves the video less freedom than ``other``, which differs in one parameter."""
-        return self.weight > other.weight or self.pace > other.pace or self.coefficients < other.coefficients
-
-    def with_weight(self, factor: float) -> Candidate | None:
-        """The candidate with another weight; None beyond the limits."""
-        weight = rounded(self.weight * factor)
-        return replace(self, weight=weight) if LEAST_WEIGHT <= weight <= LARGEST_WEIGHT else None
-
-    def with_pace(self, factor: float) -> Candidate | None:
-        """The candidate with another pace; None beyond the limits."""
-        pace = self.pace * factor
-        return replace(self, pace=pace) if LEAST_PACE <= pace <= LARGEST_PACE else None
-
-    def with_cosines(self, step: int, frames: int) -> Candidate | None:
-        """The candidate with the next number of cosines in either direction; None beyond the limits."""
-        counts = sorted({min(count, frames) for count in COSINES})
-        at = counts.index(self.coefficients) + step
-        return replace(self, coefficients=counts[at]) if 0 <= at < len(counts) else None
-
-
-STILL = Candidate("still", 1, 2e-3)
-SMOOTH = Candidate("smooth", 24, 3e-3, 1.0)
-VOLUME = Candidate("volume", 24, 2e-3, 4.0)
-CALM = Candidate("volume", 24, 2e-3, 16.0)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -131,7 +80,7 @@ class Trial:
     candidate: Candidate
     admm: Admm
     denoiser: Denoiser
-    basis: TemporalBasis
+    basis: TemporalBasis | CyclicBasis
     operator: Operator
     brightness: NDArray[Any] | None
     errors: NDArray[np.float64]
@@ -179,7 +128,8 @@ class Workbench:
         self.frames, self._side, _ = segment.geometry.video_shape(*self._merges)
         self._brightness: NDArray[Any] | None = None  # of the next trials; a trial keeps its own
         self._bright_cosines = self.frames
-        self._operators: dict[tuple[int, bool], Operator] = {}  # successive trials mostly share one
+        # successive trials mostly share one
+        self._operators: dict[tuple[int, bool, float], Operator] = {}
 
         # energy of the normalised lines' response to steady light in the voxel in the middle of the picture
         constant = TemporalBasis(self.frames, 1, problem.arrays)
@@ -246,6 +196,41 @@ class Workbench:
         self._use_brightness(best.brightness)
         return best
 
+    def repeat(self, period_frames: float, rival: float) -> Trial:
+        """Try a cycle of about this period, or of a part of it, since a multiple of a period is one, too."""
+        best = self._cycle(period_frames, rival)
+        for part in PARTS:
+            shorter = best.candidate.period_frames / part
+            if best.error < rival and shorter > 2 * FEWEST_HARMONICS and not self.clock.spent(SEARCH_SHARE):
+                found = self._cycle(shorter, best.error)
+                best = found if found.error <= best.error else best
+        return best
+
+    def _cycle(self, period_frames: float, rival: float) -> Trial:
+        """A cycle, whose period is fitted to the lines if it may yet predict better than a rival."""
+        harmonics = min(CYCLE.coefficients // 2, int(period_frames / 2))
+        cycle = replace(CYCLE, coefficients=2 * harmonics + 1, period_frames=period_frames)
+        found = self.probe(self.fitting(cycle), rival)
+        return self.follow_period(found) if found.error < NEARLY_REPEATS * rival else found
+
+    def follow_period(self, best: Trial) -> Trial:
+        """Fit the period and the cycle in turn as long as this improves the prediction."""
+        stride = LONG_STRIDE
+        for _ in range(PERIOD_ROUNDS):
+            basis = best.basis
+            if self.clock.spent(SEARCH_SHARE) or not isinstance(basis, CyclicBasis):
+                break
+            operator = partial(self._new_operator, None)
+            period = better_period(self.problem, best.admm.theta, basis, operator, stride)
+            found = self.attempt(replace(best.candidate, period_frames=period), PROBE, best)
+            if found.error < best.error:
+                best = found
+            elif stride > 1:
+                stride = 1.0
+            else:
+                break
+        return best
+
     def _fit_brightness(self, video: NDArray[Any], brightness: NDArray[Any] | None, cosines: int) -> None:
         """Use the brightness that a video, which has a ``brightness`` already, needs in the next trials."""
         found = fit_brightness(self._segment, self.problem, video, self._merges, cosines)
@@ -269,7 +254,7 @@ class Workbench:
 
     def attempt(self, candidate: Candidate, iterations: int, start: Trial | None = None) -> Trial:
         """Solve a candidate from ``start`` for this many iterations, or as many as there is time for."""
-        basis = TemporalBasis(self.frames, candidate.coefficients, self.problem.arrays)
+        basis = candidate.basis(self.frames, self.problem.arrays)
         brightness = self._brightness if candidate.brightness else None
         operator = self._operator(basis, brightness)
         shape, denoiser = (basis.count, self._side, self._side), candidate.denoiser()
@@ -288,6 +273,7 @@ class Workbench:
             start is not None
             and start.bench.fine == self.fine
             and start.bench.background is self.background
+            and start.candidate.prior == candidate.prior
             and start.candidate.coefficients == candidate.coefficients
         ):
             admm.resume(start.admm)
@@ -355,7 +341,7 @@ class Workbench:
         improved = True
         while improved:
             improved = False
-            for step in self._steps(best.candidate.prior):
+            for step in best.candidate.steps(self.frames):
                 while (candidate := step(best.candidate)) is not None and candidate not in tried:
                     if len(tried) > trials or self.clock.spent(SEARCH_SHARE):
                         return best
@@ -366,17 +352,6 @@ class Workbench:
                         break
                     best, improved = found, True
         return best
-
-    def _steps(self, prior: str) -> Sequence[Callable[[Candidate], Candidate | None]]:
-        """Ways to change a candidate with this prior; each returns None at its limit."""
-        factor = WEIGHT_STEP**2 if prior == "smooth" else WEIGHT_STEP
-        weights = [partial(Candidate.with_weight, factor=by) for by in (1 / factor, factor)]
-        if prior == "still":
-            return weights
-        stride = PACE_STEP if prior == "volume" else 2.0
-        paces = [partial(Candidate.with_pace, factor=by) for by in (1 / stride, stride)]
-        counts = [partial(Candidate.with_cosines, step=step, frames=self.frames) for step in (1, -1)]
-        return [*weights, *paces, *counts]
 
     def finish(self, best: Trial) -> Chosen:
         """Solve the best trial with all samples, none held out, on the bench where it was tried."""
@@ -401,19 +376,22 @@ class Workbench:
             self.clock.converged()
         return Chosen(self, last)
 
-    def _background(self, basis: TemporalBasis) -> Array | None:
+    def _background(self, basis: Basis) -> Array | None:
         return None if self.background is None else resized(self.background, basis)
 
-    def _operator(self, basis: TemporalBasis, brightness: NDArray[Any] | None) -> Operator:
-        key, segment = (basis.count, brightness is not None), self._segment
+    def _operator(self, basis: TemporalBasis | CyclicBasis, brightness: NDArray[Any] | None) -> Operator:
+        period = basis.period_frames if isinstance(basis, CyclicBasis) else 0.0
+        key = (basis.count, brightness is not None, period)
         if key not in self._operators:
-            code: NDArray[Any] = segment.code
-            if brightness is not None:
-                code = code * np.repeat(brightness, self._merges[1])[: len(code)]
-            self._operators[key] = band_operator(
-                segment.geometry, code, basis, *self._merges, segment.alignment, segment.blur
-            )
+            self._operators[key] = self._new_operator(brightness, basis)
         return self._operators[key]
+
+    def _new_operator(self, brightness: NDArray[Any] | None, basis: Basis) -> Operator:
+        segment = self._segment
+        code: NDArray[Any] = segment.code
+        if brightness is not None:
+            code = code * np.repeat(brightness, self._merges[1])[: len(code)]
+        return band_operator(segment.geometry, code, basis, *self._merges, segment.alignment, segment.blur)
 
 
 class Chosen:
@@ -430,8 +408,11 @@ class Chosen:
         return self._bench.video(self._trial)
 
     def facts(self) -> dict[str, Any]:
-        chosen = asdict(self._trial.candidate)
-        chosen["temporal_coefficients"] = chosen.pop("coefficients")
+        chosen, basis = asdict(self._trial.candidate), self._trial.basis
+        del chosen["coefficients"]
+        chosen["temporal_coefficients"] = basis.cosines
+        if isinstance(basis, CyclicBasis):
+            chosen["harmonics"] = basis.harmonics
         return chosen | {"candidates": self._bench.record}
 
     def continue_with(self, problem: Problem, heavier: float = 1.0, *, still: bool = False) -> ContinuedTrial:
@@ -466,34 +447,3 @@ def _with_problem(trial: Trial, problem: Problem, heavier: float) -> Trial:
     problem = replace(problem, known_lines=own.known_lines, robust_weight=own.robust_weight)  # of its bench
     operator = problem.masked(trial.operator)
     return replace(trial, admm=trial.admm.with_problem(operator, problem.used_samples, heavier))
-
-
-def rounded(weight: float) -> float:
-    """A weight to three digits, so that a search recognises candidates it has tried."""
-    return float(f"{weight:.3g}")
-
-
-def parameters(candidate: Candidate, frames: int, response: float) -> AdmmParameters:
-    """The solver's parameters for a candidate, scaled so that it means the same whatever the voxels.
-
-    λ scales with the coefficients, hence with the square root of the number of frames, and both λ and ρ with
-    the lines' ``response`` to a voxel.
-    """
-    w, extent = candidate.weight, (frames / USUAL_FRAMES) ** 0.5
-    if candidate.prior == "still":
-        # all sub-steps add up in one frame, whose mean light outweighs a detail thousands of times: only
-        # small penalties and data steps run to their end recover the details
-        weight, penalty, steps = w * extent, 0.1 * w, STILL_STEPS
-    elif candidate.prior == "smooth":
-        weight, penalty, steps = w, 2e-3, 2
-    else:
-        weight, penalty, steps = w * extent, 2e-3 * (w / 1e-3) ** 0.5, 2
-    weight, penalty = response * weight, response * penalty
-    return AdmmParameters(
-        tv_weight=weight,
-        tv_penalty=penalty,
-        sign_penalty=0.3 * penalty,  # the ratio of `AdmmParameters`
-        gradient_steps=steps,
-        gradient_share=0.0 if steps < STILL_STEPS else STILL_SHARE,
-        preconditioned=True,
-    )
