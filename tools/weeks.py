@@ -44,6 +44,8 @@ from tools.soak import own_mb
 EVERY = 20
 """Recordings between two looks at the processes."""
 ARM_EVERY, RELOAD_EVERY, JOB_EVERY, PAGE_EVERY = 200, 10, 25, 5
+MARKS, RELOADS = 2100, 130
+"""As many as fill the daemon's news, a recorder's notes, and the standard library's caches."""
 KEPT = 30
 """Recordings that are not deleted."""
 LEAST_LOOKS = 8
@@ -104,6 +106,10 @@ class Weeks:
     def work(self, until_s: float) -> None:
         with Client(self._host.socket) as client:
             client.arm(force=True)
+            for number in range(RELOADS):
+                (self._host.home / f"touched-{number % 2}").touch()
+                self._reload(client, number)
+            self._fill(client)
             while time.monotonic() < until_s:
                 try:
                     self._record(client)
@@ -111,6 +117,18 @@ class Weeks:
                 except (AcquireError, httpx.HTTPError) as error:
                     self.wrong.append(f"after {self.done['recordings']} recordings: {error}")
             client.disarm()
+
+    def _fill(self, client: Client) -> None:
+        """Fill the logs that are bounded, so that they do not grow during the first weeks either."""
+        for number in range(MARKS):
+            client.mark(f"before {number}")
+
+    def _reload(self, client: Client, number: int) -> None:
+        rig = self._host.home / "rig.toml"
+        text = rig.read_text().partition("[service]")[0]
+        rig.write_text(f'{text}[service]\nlog_level = "{("info", "warning")[number % 2]}"\n')
+        client.reload()
+        self.done["reloads"] += 1
 
     def _record(self, client: Client) -> None:
         number = self.done["recordings"]
@@ -127,12 +145,7 @@ class Weeks:
         if number % PAGE_EVERY == 0:
             self._browse(number)
         if number % RELOAD_EVERY == 0:
-            level = ("info", "warning")[number // RELOAD_EVERY % 2]
-            rig = self._host.home / "rig.toml"
-            text = rig.read_text().partition("[service]")[0]
-            rig.write_text(f'{text}[service]\nlog_level = "{level}"\n')
-            client.reload()
-            self.done["reloads"] += 1
+            self._reload(client, number // RELOAD_EVERY)
         if number % JOB_EVERY == 0:
             asked = {"kind": "cut", "recording": f"take-{number - 1}.zarr", "lines": 32}
             first = self._get(f"/api/recordings/take-{number - 1}.zarr")["first_line"]
@@ -142,6 +155,7 @@ class Weeks:
             client.disarm()
             client.arm(force=True)
             self.done["arms"] += 1
+            self._fill(client)
         if number % EVERY == 0:
             self._look(client)
 

@@ -127,9 +127,14 @@ def _lock(path: Path) -> int:
     except BlockingIOError:
         owner = os.pread(lock, LONGEST_LOCK, 0).decode("ascii", "replace").strip()
         os.close(lock)
+        process = f"process {owner if owner.isdecimal() else 'unknown'}"
+        if not os.path.lexists(path):  # otherwise each of two commands would send the user to the other
+            raise StateError(
+                f"another daemon ({process}) listens on {path}, which was removed: no command reaches it",
+                hint=f"kill {owner}, on which it seals its recording" if owner.isdecimal() else "",
+            ) from None
         raise StateError(
-            f"another daemon (process {owner if owner.isdecimal() else 'unknown'}) listens on {path}",
-            hint="acquire status, or another --socket",
+            f"another daemon ({process}) listens on {path}", hint="acquire status, or another --socket"
         ) from None
     except OSError as error:
         os.close(lock)
