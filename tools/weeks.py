@@ -17,6 +17,7 @@ from __future__ import annotations
 import argparse
 import contextlib
 import json
+import math
 import os
 import random
 import signal
@@ -46,6 +47,10 @@ EVERY = 20
 ARM_EVERY, RELOAD_EVERY, JOB_EVERY, PAGE_EVERY = 200, 10, 25, 5
 MARKS, RELOADS = 2100, 130
 """As many as fill the daemon's news, a recorder's notes, and the standard library's caches."""
+LONG = 400
+"""Recordings from which on a slope is judged; a shorter life may still load modules and fill caches."""
+MOST_IN_1000 = {"memory_mb": 2.0, "descriptors": 2.0, "threads": 1.0, "files in /dev/shm": 1.0}
+"""What 1000 recordings may add to a process."""
 KEPT = 30
 """Recordings that are not deleted."""
 LEAST_LOOKS = 8
@@ -215,7 +220,9 @@ class Weeks:
         return count, types
 
 
-def report(weeks: Weeks, run: Any, *, types: bool) -> None:
+def report(weeks: Weeks, run: Any, *, types: bool) -> list[str]:
+    """Print and keep what every process used; return what grew."""
+    wrong = []
     print(dict(weeks.done))
     for name, life in weeks.lives.items():
         if len(life.looks) < LEAST_LOOKS:
@@ -227,10 +234,17 @@ def report(weeks: Weeks, run: Any, *, types: bool) -> None:
         slopes = life.slopes()
         told = ", ".join(f"{what} {ends[what]} ({slope:+.3g})" for what, slope in slopes.items())
         print(f"{role:9} {span:5} recordings; (in 1000): {told}")
+        if span >= LONG:
+            wrong += [
+                f"{role}: 1000 recordings add {slope:.3g} {what}"
+                for what, slope in slopes.items()
+                if slope > MOST_IN_1000.get(what, math.inf)
+            ]
         columns = {f"{what.replace(' ', '_')}_in_1000": slope for what, slope in slopes.items()}
         run.add(f"{role}, {span} recordings", **columns)
         if types and life.types:
             print("         ", life.grown_types())
+    return wrong
 
 
 def main() -> int:
@@ -265,7 +279,7 @@ def main() -> int:
             for each in strangers:
                 each.join()
             wrong = weeks.wrong + host.failures_in_log() + host.close()
-        report(weeks, run, types=options.types)
+        wrong += report(weeks, run, types=options.types)
         print(f"strangers {dict(counts)}", *wrong, f"wrong     {len(wrong)}", sep="\n")
     return 1 if wrong else 0
 
