@@ -112,7 +112,9 @@ class Weeks:
         with Client(self._host.socket) as client:
             client.arm(force=True)
             for number in range(RELOADS):
-                (self._host.home / f"touched-{number % 2}").touch()
+                # A directory on the path that has changed is looked through again.
+                (self._host.home / "touched").touch()
+                (self._host.home / "touched").unlink()
                 self._reload(client, number)
             self._fill(client)
             while time.monotonic() < until_s:

@@ -61,7 +61,7 @@ class HooksConfig(FrozenModel):
         # A recording's rig has null for a webhook that was not given: it passes like any valid URL.
         given = url or "http://x"
         if any(letter <= " " or letter == "\x7f" for letter in given):
-            raise ValueError("it contains a space or a control character")
+            raise ValueError("it has a space or a control character")
         try:
             parts = urlsplit(given)
             _ = parts.port  # as if it were asked for later; the error would quote it
