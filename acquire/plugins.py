@@ -11,9 +11,11 @@ other distributions claim belongs to neither.
 
 from __future__ import annotations
 
+import contextlib
 import difflib
 import importlib
 import inspect
+import sys
 import tomllib
 from dataclasses import dataclass, replace
 from functools import cache
@@ -179,10 +181,14 @@ def _found_ours(group: str) -> tuple[Plugin, ...]:
 @cache
 def _outcome(group: Group, entry: metadata.EntryPoint) -> tuple[Any, str]:
     """Return the object that an entry point names, and why it is unusable; tried once per process."""
+    if entry.pattern.match(entry.value) is None:  # the standard library's own error says nothing
+        return None, f"its entry point {shown(entry.value)} is not MODULE:CLASS"
     try:
-        loaded = entry.load()
+        # What a module prints as it is imported would be in the midst of a command's JSON.
+        with contextlib.redirect_stdout(sys.stderr):
+            loaded = entry.load()
     except (Exception, SystemExit) as error:  # noqa: BLE001  # somebody else's module may fail in any way
-        return None, shortened(f"{type(error).__name__}: {error}", 400)
+        return None, shortened(f"{type(error).__name__}: {error}".removesuffix(": "), 400)
     return loaded, _unsuitable(group, entry, loaded)
 
 

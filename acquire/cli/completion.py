@@ -138,6 +138,8 @@ def _paths(incomplete: str, suffixes: Iterable[str]) -> list[str]:
             if hidden or not path.name.startswith(begun) or not _PLAIN_NAME.fullmatch(path.name):
                 continue
             word = f"{parent}/{path.name}" if "/" in incomplete else path.name
+            if word.startswith("-"):  # it would be an option
+                word = f"./{word}"
             if path.name.endswith(tuple(suffixes)):
                 found.append(word)
             elif path.is_dir():

@@ -19,8 +19,19 @@ LONGEST_SOCKET = 90
 """Longest path of a socket (bytes) that every system accepts."""
 
 
+def given_path(text: str) -> str:
+    """Parse a path or URL. Raises UsageError for an empty one, which would be the current directory."""
+    # As `acquire recover "$RUN"` in a shell without RUN.
+    if not text:
+        raise UsageError(
+            "the path is empty", possible="a path or URL", hint=". if the current directory is meant"
+        )
+    return text
+
+
 def local_path(text: str) -> Path:
-    """Parse a path on this machine. Raises UsageError for a URL of anything else."""
+    """Parse a path on this machine. Raises UsageError for an empty one, and a URL of anything else."""
+    given_path(text)
     if "://" in text and not text.startswith("file://"):
         raise UsageError(
             f"{text} is a URL, but this command changes a recording in place, which a remote store does not "
@@ -30,6 +41,11 @@ def local_path(text: str) -> Path:
         )
     # A file URL is a path on this machine, and other programs hand these out.
     return Path(text.removeprefix("file://"))
+
+
+def local_directory(text: str) -> Path:
+    """Parse a directory. Raises UsageError for an empty path."""
+    return Path(given_path(text))
 
 
 @contextlib.contextmanager

@@ -10,7 +10,7 @@ import typer
 
 from acquire.cli.completion import recordings
 from acquire.cli.output import JsonFlag, print_facts, print_json, print_table, quantity, say
-from acquire.cli.places import local_path
+from acquire.cli.places import given_path, local_directory, local_path
 from acquire.cli.progress import stage_progress
 from acquire.cli.recording_page import COLUMNS, LISTED, list_row, recording_facts
 from acquire.cli.stretch import FirstLineOption, FromOption, LinesOption, ToOption, lines_between
@@ -29,6 +29,7 @@ PlaceArgument = Annotated[
         metavar="RECORDING",
         autocompletion=recordings,
         help="Recording: a directory NAME.zarr, or its URL, such as s3://bucket/NAME.zarr.",
+        parser=given_path,
     ),
 ]
 
@@ -50,7 +51,9 @@ def register(app: typer.Typer) -> None:
 
 
 def list_recordings(
-    directory: Annotated[Path, typer.Argument(metavar="DIR", help="Directory to list.")] = Path(),
+    directory: Annotated[
+        Path, typer.Argument(metavar="DIR", help="Directory to list.", parser=local_directory)
+    ] = Path(),
     json: JsonFlag = False,
 ) -> None:
     """List the recordings in a directory, or one recording. Damaged ones are marked.

@@ -23,7 +23,7 @@ def explained(error: ValidationError, model: type[BaseModel], path: Path | str) 
     findings = _without_consequences(error.errors())
     lines = [f"{path}: {len(findings)} error(s)"]
     for item in findings[:MOST_LISTED]:
-        keys, allowed = _locate(model, item["loc"])
+        keys, allowed, secret = _locate(model, item["loc"])
         key = shortened(".".join(keys)) or "(file)"
         why = shortened(own_words(item["msg"]), 400)
         # pydantic's own sentence, "Extra inputs are not permitted", does not name the keys that are.
@@ -31,8 +31,8 @@ def explained(error: ValidationError, model: type[BaseModel], path: Path | str) 
             lines.append(f"  {key}: unknown key; allowed here: {', '.join(allowed) or 'none'}")
         elif item["type"] == "missing":
             lines.append(f"  {key}: missing")
-        # A whole table would be longer than the reason.
-        elif isinstance(item["input"], dict):
+        # A whole table would be longer than the reason, and a secret would be in the daemon's log.
+        elif secret or isinstance(item["input"], dict):
             lines.append(f"  {key}: {why}")
         else:
             lines.append(f"  {key} = {shown(item['input'])}: {why}")
@@ -54,8 +54,8 @@ def _without_consequences(findings: list[Any]) -> list[Any]:
     ]
 
 
-def _locate(model: type[BaseModel], location: tuple[int | str, ...]) -> tuple[list[str], list[str]]:
-    """Return the key as it is in the file, and the keys allowed next to it.
+def _locate(model: type[BaseModel], location: tuple[int | str, ...]) -> tuple[list[str], list[str], bool]:
+    """Return the key as it is in the file, the keys allowed next to it, and whether its value is a secret.
 
     pydantic's location also contains the tags of unions and groups, which are not in the file. The schema
     distinguishes them from keys.
@@ -64,6 +64,7 @@ def _locate(model: type[BaseModel], location: tuple[int | str, ...]) -> tuple[li
     node: dict[str, Any] = schema
     keys: list[str] = []
     allowed: list[str] = []
+    secret = False
     for part in location:
         while "$ref" in node:
             node = schema["$defs"][node["$ref"].rsplit("/", 1)[1]]
@@ -77,4 +78,5 @@ def _locate(model: type[BaseModel], location: tuple[int | str, ...]) -> tuple[li
         keys.append(str(part))
         allowed = sorted(node.get("properties", {}))
         node = node.get("items", {}) if isinstance(part, int) else node.get("properties", {}).get(part, {})
-    return keys, allowed
+        secret = secret or bool(node.get("writeOnly"))
+    return keys, allowed, secret

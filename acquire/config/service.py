@@ -47,6 +47,8 @@ class HooksConfig(FrozenModel):
     webhook: str | None = Field(
         default=None,
         description="URL to which the event is posted as JSON; recordings, logs and pages name its host only",
+        # What errors do not quote (`acquire.config.findings`).
+        json_schema_extra={"writeOnly": True},
     )
     timeout_s: float = Field(
         default=10.0, gt=0, le=600, description="time after which command or webhook is abandoned"
@@ -57,7 +59,14 @@ class HooksConfig(FrozenModel):
     def _is_http(cls, url: str | None) -> str | None:
         """Refuse secrets, because the configuration is stored in every recording."""
         # A recording's rig has null for a webhook that was not given: it passes like any valid URL.
-        parts = urlsplit(url or "http://x")
+        given = url or "http://x"
+        if any(letter <= " " or letter == "\x7f" for letter in given):
+            raise ValueError("it has a space or a control character")
+        try:
+            parts = urlsplit(given)
+            _ = parts.port  # as if it were asked for later; the error would quote it
+        except ValueError:
+            raise ValueError("it is not a URL: its host or port is invalid") from None
         if parts.scheme not in ("http", "https") or not parts.hostname:
             raise ValueError("it is not an http or https URL")
         if "@" in parts.netloc:

@@ -6,6 +6,8 @@ published, so that it never waits for a device.
 
 from __future__ import annotations
 
+import asyncio
+import contextlib
 from typing import TYPE_CHECKING, Any
 
 from fastapi import FastAPI, Request
@@ -60,6 +62,7 @@ def new_app(description: str, **options: Any) -> FastAPI:
         **options,
     )
     app.add_middleware(BoundedBody)
+    app.add_middleware(HeadAsGet)
     _add_errors(app)
     return app
 
@@ -82,6 +85,38 @@ class BoundedBody:
             return message
 
         await self._app(scope, bounded, send)
+
+
+class HeadAsGet:
+    """Middleware that answers HEAD as GET without the body, which RFC 9110 wants; FastAPI refuses it."""
+
+    def __init__(self, app: ASGIApp) -> None:
+        self._app = app
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        if scope["type"] != "http" or scope["method"] != "HEAD":
+            await self._app(scope, receive, send)
+            return
+        answered = asyncio.Event()
+
+        async def without_body(message: Message) -> None:
+            if message["type"] == "http.response.start":
+                await send(message)
+            elif not answered.is_set():
+                await send({"type": "http.response.body", "body": b"", "more_body": False})
+                answered.set()
+
+        answering = asyncio.ensure_future(self._app({**scope, "method": "GET"}, receive, without_body))
+        enough = asyncio.ensure_future(answered.wait())
+        try:
+            await asyncio.wait((answering, enough), return_when=asyncio.FIRST_COMPLETED)
+        finally:
+            enough.cancel()
+            # A stream would go on for ever, and a file would be read to its end.
+            if answered.is_set() or not answering.done():
+                answering.cancel()
+        with contextlib.suppress(asyncio.CancelledError):
+            await answering
 
 
 def _add_errors(app: FastAPI) -> None:

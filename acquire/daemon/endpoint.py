@@ -127,9 +127,15 @@ def _lock(path: Path) -> int:
     except BlockingIOError:
         owner = os.pread(lock, LONGEST_LOCK, 0).decode("ascii", "replace").strip()
         os.close(lock)
+        known = owner.isdecimal()
+        owner = owner if known else "unknown"
+        if not os.path.lexists(path):  # otherwise each of two commands would send the user to the other
+            raise StateError(
+                f"another daemon (process {owner}) listens on {path}, which was removed",
+                hint=f"kill {owner}, on which it seals its recording" if known else "",
+            ) from None
         raise StateError(
-            f"another daemon (process {owner if owner.isdecimal() else 'unknown'}) listens on {path}",
-            hint="acquire status, or another --socket",
+            f"another daemon (process {owner}) listens on {path}", hint="acquire status, or another --socket"
         ) from None
     except OSError as error:
         os.close(lock)

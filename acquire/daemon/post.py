@@ -27,6 +27,8 @@ def main(limit_s: float) -> str | None:
         return str(error)
     except http.client.HTTPException as error:  # the port is another service's, or that of https
         return f"the answer is not HTTP: {error!r}"
+    except UnicodeError:  # its text would quote the URL's path, which may be a secret
+        return "the URL has a letter that is not ASCII: write it as %XX"
 
 
 if __name__ == "__main__":

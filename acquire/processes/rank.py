@@ -15,5 +15,8 @@ oom_score_adj.
 def stand_back(nice: int, oom_score: int) -> None:
     """Lower the rank of this process and all that it starts: its work can be repeated, lines cannot."""
     os.nice(nice)
+    # Then it never interrupts a running grabber when it wakes up. Its share of the processors stays the same.
+    with contextlib.suppress(OSError):  # a service that may not
+        os.sched_setscheduler(0, os.SCHED_BATCH, os.sched_param(0))
     with contextlib.suppress(OSError):  # a kernel without it, or a service that may not
         Path("/proc/self/oom_score_adj").write_text(str(oom_score), encoding="ascii")

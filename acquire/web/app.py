@@ -38,7 +38,7 @@ from acquire.web.messages import (
 )
 from acquire.web.page_stream import Pages
 from acquire.web.passing import Passing
-from acquire.web.tokens import COOKIE, Tokens
+from acquire.web.tokens import COOKIE, TokenFile, Tokens
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable
@@ -87,7 +87,7 @@ class Reading:
 
 
 def build_page(
-    socket: Path, directory: Path, tokens: Tokens, names: frozenset[str], *, secure: bool
+    socket: Path, directory: Path, tokens: Tokens | TokenFile, names: frozenset[str], *, secure: bool
 ) -> Guard:
     """Return the page's application for the daemon on ``socket``, whose recordings are in ``directory``.
 
@@ -133,7 +133,7 @@ def build_page(
     return guard
 
 
-def _add_session(api: APIRouter, guard: Guard, tokens: Tokens, *, secure: bool) -> None:
+def _add_session(api: APIRouter, guard: Guard, tokens: Tokens | TokenFile, *, secure: bool) -> None:
     @api.post("/session", summary="Exchange a token for a cookie")
     async def enter(request: Request, asked: SessionRequest, response: Response) -> Session:
         address = request.client.host if request.client else ""

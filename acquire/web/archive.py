@@ -50,6 +50,7 @@ SAMPLED_FRAMES = 24
 """Number of frames from which a video's display range is computed."""
 VIDEO = "acquire-video/"
 LOST_COLOUR = (200, 0, 140)
+_Stamp = tuple[int, int, int] | None
 
 
 class Archive:
@@ -58,7 +59,9 @@ class Archive:
     def __init__(self, directory: Path) -> None:
         self._directory = directory
         self._pictures: OrderedDict[tuple[Any, ...], bytes] = OrderedDict()
-        self._facts: OrderedDict[tuple[Any, ...], RecordingFacts] = OrderedDict()
+        self._facts: dict[str, tuple[_Stamp, RecordingFacts]] = {}
+        self._kinds: dict[str, tuple[_Stamp, bool]] = {}
+        """Name → its root document, and whether it is a video. Like the facts: of what was listed last."""
         self._ranges: OrderedDict[tuple[str, int], tuple[float, float]] = OrderedDict()
 
     def path_of(self, name: str, suffix: str = ".zarr") -> Path:
@@ -79,7 +82,11 @@ class Archive:
 
     def recordings(self) -> list[RecordingFacts]:
         """Return the recordings, newest first."""
-        return [self._known_facts(path) for path in self._entries(video=False)]
+        entries = self._entries(video=False)
+        listed = [self._known_facts(path) for path in entries]
+        # Recordings come and go for weeks.
+        self._facts = {path.name: self._facts[path.name] for path in entries if path.name in self._facts}
+        return listed
 
     def recording(self, name: str) -> RecordingDetail:
         """Return a recording with its events, gaps and holds. Raises PlaceError and DataError."""
@@ -165,34 +172,51 @@ class Archive:
             entries = list(self._directory.iterdir())
         except OSError as error:
             raise PlaceError(f"{self._directory} cannot be listed: {error.strerror}") from error
+        kinds = {}
         # Links are left out: lstat never reports one as a directory.
         for path in entries:
             try:
                 mode = path.lstat()
-                if path.suffix == ".zarr" and stat.S_ISDIR(mode.st_mode) and _is_video(path) is video:
-                    found.append((mode.st_mtime_ns, path))
             except OSError:
                 continue
+            if path.suffix != ".zarr" or not stat.S_ISDIR(mode.st_mode):
+                continue
+            stamp = _stamp(path)
+            known = self._kinds.get(path.name)
+            # A page asks for both lists every three seconds, and there may be thousands of entries.
+            if known is None or known[0] != stamp or stamp is None:
+                known = stamp, _is_video(path)
+            kinds[path.name] = known
+            if known[1] is video:
+                found.append((mode.st_mtime_ns, path))
+        self._kinds = kinds
         return [path for _, path in sorted(found, reverse=True)[:MOST_LISTED]]
 
     def _known_facts(self, path: Path) -> RecordingFacts:
         """Return a recording's facts, from the cache if it is sealed and unchanged."""
+        stamp = _stamp(path)
+        before = self._facts.get(path.name)
+        if before is not None and before[0] == stamp and stamp is not None:
+            return before[1]
         try:
-            changed = (path / "zarr.json").stat().st_mtime_ns
-        except OSError:
-            changed = 0
-        key = (path.name, changed)
-        if (known := self._facts.get(key)) is None:
-            try:
-                known = _facts(path, open_recording(path))
-            except AcquireError as error:
-                return RecordingFacts(name=path.name, error=shortened(error.message, 300))
-            except (*DAMAGE, MemoryError) as error:
-                return RecordingFacts(name=path.name, error=f"cannot be read: {shortened(error, 300)}")
-            # A recording that is being written changes more often than its root document does.
-            if known.state == "sealed":
-                _remember(self._facts, key, known, 2 * MOST_LISTED)
+            known = _facts(path, open_recording(path))
+        except AcquireError as error:
+            return RecordingFacts(name=path.name, error=shortened(error.message, 300))
+        except (*DAMAGE, MemoryError) as error:
+            return RecordingFacts(name=path.name, error=f"cannot be read: {shortened(error, 300)}")
+        # A recording that is being written changes more often than its root document does.
+        if known.state == "sealed":
+            self._facts[path.name] = stamp, known
         return known
+
+
+def _stamp(path: Path) -> _Stamp:
+    """Return what changes whenever the root document does, which is replaced as a whole; None without one."""
+    try:
+        found = (path / "zarr.json").stat()
+    except OSError:
+        return None
+    return found.st_mtime_ns, found.st_size, found.st_ino
 
 
 def _remember(cache: OrderedDict[Any, Any], key: Any, value: Any, most: int) -> None:

@@ -26,7 +26,7 @@ from acquire.daemon.messages import error_body
 from acquire.daemon.who import LONGEST, WHO
 from acquire.errors import UsageError
 from acquire.text import shortened
-from acquire.web.tokens import COOKIE, Role, Tokens
+from acquire.web.tokens import COOKIE, Role, TokenFile, Tokens
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -98,7 +98,7 @@ class Buckets:
 class Guard:
     """ASGI middleware; see the module."""
 
-    def __init__(self, app: ASGIApp, tokens: Tokens, names: frozenset[str]) -> None:
+    def __init__(self, app: ASGIApp, tokens: Tokens | TokenFile, names: frozenset[str]) -> None:
         """``names`` are the page's host names, in lower case and without a port."""
         self._app = app
         self._tokens = tokens

@@ -20,6 +20,7 @@ from acquire.daemon.states import State
 from acquire.errors import AcquireError, NoDaemonError
 from acquire.web.frames import json_message, message
 from acquire.web.glimpser import Glimpser
+from acquire.web.live import RECORDING_TURN_S, TURN_S
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -31,6 +32,8 @@ STATUS_S = 0.5
 LOST_S = 1.5
 """Silence after which the daemon counts as lost; it sends a status every `STATUS_S`."""
 RETRY_S = 0.25
+KEPT_S = 0.1
+"""Age up to which all pages get the same state message: to make one takes longer than to send it."""
 MOST_NEWS = 500
 """Number of news items kept for pages that are opened later."""
 
@@ -56,6 +59,8 @@ class Hub:
         self._version = 0
         self._run_id: str | None = None
         self._waiting: set[asyncio.Event] = set()
+        self._made: tuple[int, float, bytes] = -1, 0.0, b""
+        """The latest state message, with its version and when it was made."""
 
     async def run(self) -> None:
         """Follow the daemon until cancelled."""
@@ -89,10 +94,15 @@ class Hub:
         """Return the latest status with its health, or a message that the daemon does not answer."""
         if not self.connected or self.status is None:
             return message({"type": "link", "connected": False, "why": self.why})
+        version, made_s, made = self._made
+        if version == self._version and time.monotonic() - made_s < KEPT_S:
+            return made
         status, health = self.status.model_dump_json(), self.health().model_dump_json()
         # The browser's own clock may be wrong: how old a state is follows from ours.
         facts = f'{{"now_ms":{time.time_ns() // 1_000_000},"status":{status},"health":{health}}}'
-        return json_message("state", facts)
+        made = json_message("state", facts)
+        self._made = self._version, time.monotonic(), made
+        return made
 
     def health(self) -> Health:
         """Return the health of the latest status. Raises NoDaemonError if the daemon does not answer."""
@@ -102,6 +112,8 @@ class Hub:
 
     def news_after(self, number: int) -> tuple[int, list[bytes]]:
         """Return the next number, and the messages from ``number`` on that are still kept."""
+        if number >= self._count:  # usually: pages ask twenty times a second, and hundreds of news are kept
+            return self._count, []
         return self._count, [news for k, news in self._news if k >= number]
 
     def listen(self) -> asyncio.Event:
@@ -128,6 +140,7 @@ class Hub:
                 if not self.connected:
                     log.info("connected to the daemon (process %d)", item.pid)
                 self.connected, self.status = True, item
+                self.live.turn_s = RECORDING_TURN_S if self.is_recording else TURN_S
                 self._version += 1
                 if item.run_id != self._run_id:  # each run has its own rings
                     self._run_id = item.run_id

@@ -198,6 +198,7 @@ class Jobs:
             kept = result if name else not code
             text = "the result so far was kept" if kept else "nothing was kept"
         job.update(state=state, text=text, result=result)
+        job.process = None  # the job is listed for long, and its process holds a pipe with its buffers
         subject = job.facts.step or job.facts.recording
         log.info("job %d, %s of %s: %s", job.facts.id, job.facts.kind, subject, state)
 

@@ -26,6 +26,9 @@ if TYPE_CHECKING:
 
 TURN_S = 0.05
 """Twenty pictures a second."""
+RECORDING_TURN_S = 0.1
+"""The same during a recording, which takes precedence. A turn costs more than the pixels in it: since the one
+before, the lines have displaced everything else from the processors' caches."""
 KEPT_S = 2.0
 MOST_BLOCKS = 4096
 """Largest number of blocks read per turn; the rest waits for the next."""
@@ -47,6 +50,8 @@ class Live:
         self._changed = threading.Event()
         self._ended = False
         self._thread = threading.Thread(target=self._run, name="live", daemon=True)
+        self.turn_s = TURN_S
+        """Time between two pictures; may be set at any time."""
         self.error = ""
         """The reason why there is no picture."""
 
@@ -114,7 +119,7 @@ class Live:
                             self._messages.append((self._count, content))
                             self._count += 1
                 self._wake()
-                left_s = TURN_S - (time.monotonic() - began_s)
+                left_s = self.turn_s - (time.monotonic() - began_s)
                 if left_s > 0:
                     time.sleep(left_s)
         finally:

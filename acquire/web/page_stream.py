@@ -21,8 +21,9 @@ if TYPE_CHECKING:
 MOST_PAGES = 24
 LEAST_S = 0.045
 """Shortest time between two writes, which are then about twenty per second."""
-STATE_S = 0.5
-"""Longest time between two states: a page that receives nothing for two seconds shows a warning."""
+STATE_S = 0.8
+"""Longest time between two states: a page that receives nothing for two seconds shows a warning. Longer than
+the time between two statuses (`hub.STATUS_S`), so that no state is sent twice."""
 
 
 class Pages:

@@ -16,7 +16,7 @@ from acquire.daemon.connections import Connection, raise_descriptor_limit
 from acquire.errors import NoDaemonError, UsageError
 from acquire.processes.rank import EARLY, stand_back
 from acquire.web.app import build_page
-from acquire.web.tokens import Tokens, load_tokens
+from acquire.web.tokens import TokenFile, load_tokens
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -39,7 +39,7 @@ def serve_page(socket: Path, directory: Path, config: WebConfig) -> None:
     """
     stand_back(NICE, EARLY)
     raise_descriptor_limit()
-    tokens = load_tokens(config.token_path(socket))
+    tokens = TokenFile(config.token_path(socket))
     context = _tls(config)
     with contextlib.closing(_listen(config)) as listener:
         log.info("the operator's page: %s (the token: acquire web --link)", address_of(config, listener))
@@ -49,7 +49,7 @@ def serve_page(socket: Path, directory: Path, config: WebConfig) -> None:
 async def _serve(
     socket: Path,
     directory: Path,
-    tokens: Tokens,
+    tokens: TokenFile,
     config: WebConfig,
     listener: sockets.socket,
     context: ssl.SSLContext | None,

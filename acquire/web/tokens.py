@@ -2,7 +2,7 @@
 
 A browser exchanges the token for a cookie, which scripts of other pages can neither read nor make it send.
 The cookie is derived from the token (HMAC), so that it is valid as long as the token is, whichever process
-serves the page. To change the tokens, delete the file.
+serves the page. To change the tokens, delete the file: a running page notices it (`TokenFile`).
 """
 
 from __future__ import annotations
@@ -10,9 +10,11 @@ from __future__ import annotations
 import hashlib
 import hmac
 import json
+import logging
 import os
 import secrets
 import stat
+import time
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal
 
@@ -26,6 +28,9 @@ ROLES: tuple[Role, ...] = ("operator", "viewer")
 COOKIE = "acquire_session"
 _TOKEN_BYTES = 24
 _MOST_BYTES = 4096
+LOOK_EVERY_S = 1.0
+
+log = logging.getLogger("acquire.web")
 
 
 @dataclass(frozen=True, slots=True, repr=False)
@@ -56,6 +61,53 @@ class Tokens:
             if hmac.compare_digest(given.encode(), right(role).encode()):  # type: ignore[operator]
                 found = role
         return found
+
+
+class TokenFile:
+    """The tokens of a file as it is now: whoever deletes it wants the old ones to be invalid."""
+
+    def __init__(self, path: Path) -> None:
+        """Read or create the file. Raises UsageError as `load_tokens` does."""
+        self._path = path
+        self._tokens = load_tokens(path)
+        self._stamp, self._looked_s = _stamp(path), time.monotonic()
+
+    def role_of_token(self, token: str) -> Role | None:
+        return self.current.role_of_token(token)
+
+    def role_of_cookie(self, cookie: str) -> Role | None:
+        return self.current.role_of_cookie(cookie)
+
+    def cookie(self, role: Role) -> str:
+        return self.current.cookie(role)
+
+    @property
+    def current(self) -> Tokens:
+        """The tokens of a moment ago. Those of a file that has become invalid stay valid."""
+        now_s = time.monotonic()
+        if now_s - self._looked_s >= LOOK_EVERY_S:
+            self._looked_s = now_s
+            stamp = _stamp(self._path)
+            if stamp is None or stamp != self._stamp:
+                self._renew()
+        return self._tokens
+
+    def _renew(self) -> None:
+        try:
+            self._tokens = load_tokens(self._path)
+        except UsageError as error:
+            log.warning("%s; the tokens from before stay valid", error)
+        else:
+            log.info("the tokens were changed: %s", self._path)
+        self._stamp = _stamp(self._path)
+
+
+def _stamp(path: Path) -> tuple[int, int] | None:
+    try:
+        found = path.lstat()
+    except OSError:
+        return None
+    return found.st_ino, found.st_mtime_ns
 
 
 def load_tokens(path: Path) -> Tokens:

@@ -66,6 +66,14 @@ def test_recordings_and_directories_without_names_that_a_shell_would_split(
     assert offered("acquire verify old/", shell) == ["old/run.zarr"]
 
 
+def test_a_name_that_would_be_an_option_is_no_option(
+    offered: Callable[..., list[str]], tmp_path: Path
+) -> None:
+    (tmp_path / "-x.zarr").mkdir()
+    assert offered("acquire info ") == ["./-x.zarr", "old/", "take.zarr"]
+    assert offered("acquire info ./") == ["./-x.zarr", "./old/", "./take.zarr"]
+
+
 def test_the_states_are_the_daemon_s() -> None:
     assert set(STATES) == {*map(str, State), "sealed"}
 

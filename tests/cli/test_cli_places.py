@@ -278,6 +278,14 @@ CODES = {
 }
 
 
+@pytest.mark.parametrize("command", ["ls", "info", "verify", "recover", "hold", "diagnose"])
+def test_an_empty_path_is_not_the_current_directory(cli: Cli, command: str) -> None:
+    """As of a variable that is not set: `acquire ls ""` listed the current directory."""
+    answer = cli(command, "")
+    assert answer.code == 2
+    assert "the path is empty" in answer.err
+
+
 @pytest.mark.parametrize("content", CODES.values(), ids=CODES)
 def test_a_file_without_a_code_is_refused_in_words(cli: Cli, tmp_path: Path, content: bytes) -> None:
     """Each ended in a traceback of NumPy or zipfile, but for complex numbers."""

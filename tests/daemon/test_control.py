@@ -24,6 +24,7 @@ from acquire.daemon.endpoint import Endpoint
 from acquire.daemon.messages import ErrorMessage, http_status
 from acquire.daemon.service import Service
 from acquire.daemon.states import State
+from acquire.daemon.stream import MOST_STREAMS
 from acquire.errors import AcquireError, CameraError, DeviceError, NoDaemonError, StateError, UsageError
 
 
@@ -97,6 +98,25 @@ def test_requests_that_no_route_takes_are_answered_alike(
     message = ErrorMessage.model_validate_json(answer.content)
     assert message.error == "UsageError"
     assert message.message.startswith(f"the daemon cannot answer {method} {url}: ")
+
+
+@pytest.mark.parametrize("url", ["/status", "/health", "/metrics", "/openapi.json", "/events?status_s=0.05"])
+def test_head_is_answered_as_get_without_the_body(path: Path, daemon: Client, url: str) -> None:
+    """It was refused with 405. A stream has no end of its own, but the answer to HEAD has."""
+    with httpx.Client(transport=httpx.HTTPTransport(uds=str(path)), base_url="http://x", timeout=30) as raw:
+        head = raw.head(url)
+        with raw.stream("GET", url) as get:
+            assert (head.status_code, head.content) == (get.status_code, b"")
+            assert head.headers["content-type"] == get.headers["content-type"]
+        assert raw.head(url).status_code == 200  # on the same connection
+        assert raw.head("/arm").status_code == 405
+        assert raw.head("/nothing").status_code == 404
+
+
+def test_heads_of_streams_leave_no_stream_behind(path: Path, daemon: Client) -> None:
+    with httpx.Client(transport=httpx.HTTPTransport(uds=str(path)), base_url="http://x", timeout=30) as raw:
+        for _ in range(2 * MOST_STREAMS):
+            assert raw.head("/events").status_code == 200
 
 
 def test_long_requests_are_not_read(path: Path, daemon: Client, run: FakeRun) -> None:

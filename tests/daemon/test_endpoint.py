@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import socket
 import stat
@@ -46,6 +47,14 @@ def test_second_is_refused_and_the_first_lives_on(path: Path) -> None:
         client.connect(str(path))
     first.close()
     Endpoint(path).close()
+
+
+def test_a_daemon_whose_socket_was_removed_is_named(path: Path) -> None:
+    """`acquire status` said to start one, and `acquire serve` to ask for the status."""
+    with contextlib.closing(Endpoint(path)):
+        path.unlink()
+        with pytest.raises(StateError, match=f"which was removed; try: kill {os.getpid()},"):
+            Endpoint(path)
 
 
 def test_left_behind_by_a_killed_process(path: Path) -> None:

@@ -156,6 +156,37 @@ def test_webhooks_that_cannot_be_are_refused(url: str) -> None:
         load_rig("rig-demo", {"hooks.webhook": url})
 
 
+@pytest.mark.parametrize(
+    "url",
+    [
+        "https//chat/s3cret",
+        "ftp://chat/s3cret",
+        "http://chat:s3cret/x",
+        "http://[chat/s3cret",
+        "http://chat/s3 cret\n",
+        "http://user:s3cret@chat/",
+        ["http://chat/s3cret"],
+    ],
+)
+def test_a_webhook_that_is_refused_is_not_quoted(url: object) -> None:
+    """The error is logged by a reload, and is among the news that every page shows."""
+    with pytest.raises(ConfigError, match=r"hooks\.webhook: ") as refused:
+        load_rig("rig-demo", {"hooks.webhook": url})
+    assert "s3" not in str(refused.value)
+
+
+def test_a_webhook_with_a_letter_that_no_url_has_is_not_quoted_in_the_log(
+    caplog: pytest.LogCaptureFixture, capfd: pytest.CaptureFixture[str]
+) -> None:
+    log = NewsLog()
+    hooks = Hooks(load_rig("rig-demo", {"hooks.webhook": "http://127.0.0.1:9/s3crét"}).hooks, log, "rig")
+    log.add("loss", "x", level="error")
+    until(lambda: "hook http://127.0.0.1:9/…: the URL has a letter" in caplog.text)
+    hooks.close()
+    assert "s3cr" not in caplog.text
+    assert "Traceback" not in capfd.readouterr().err
+
+
 def test_the_secret_in_a_webhook_s_path_stays_in_the_rig_file(caplog: pytest.LogCaptureFixture) -> None:
     """Whoever knows the path of a chat's webhook may write there; recordings are passed on."""
     with socket.create_server(("127.0.0.1", 0)) as server:

@@ -271,3 +271,12 @@ def test_what_is_not_installed_is_refused_with_a_hint(monkeypatch: pytest.Monkey
     with pytest.raises(ConfigError, match="not installed") as refused:
         check_upload(rig)
     assert "tdi-acquire[remote]" in refused.value.hint
+
+
+def test_without_a_target_recordings_are_not_remembered(tmp_path: Path) -> None:
+    """The path of every recording was, until the daemon ended."""
+    uploads = Uploads()
+    for number in range(10):
+        uploads.add(tmp_path / f"{number}.zarr")
+    assert not uploads._ours
+    assert uploads.statuses == []

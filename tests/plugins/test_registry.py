@@ -103,6 +103,9 @@ def test_an_unknown_effect_is_told_with_what_there_is_and_from_where(
         ("lab_light:Glow", "def broken(:", "SyntaxError"),
         ("lab_light:Glow", "raise SystemExit('no licence')", "SystemExit: no licence"),
         ("lab_light:Gone", GLOW, "has no attribute 'Gone'"),
+        ("lab light::", GLOW, "its entry point 'lab light::' is not MODULE:CLASS"),
+        ("", GLOW, "its entry point '' is not MODULE:CLASS"),
+        ("lab_light:Glow", "raise MemoryError", r"MemoryError; possible"),
         ("lab_light:Stage", GLOW, "is not a class that extends acquire.sim.effects.base.Effect"),
         ("lab_light:Glow", GLOW.replace('"glow"]', '"glare"]'), r"needs kind: Literal\['glow'\]"),
         ("lab_light:Glow", GLOW.replace("def stages", "def steps"), "does not define stages"),
@@ -118,6 +121,16 @@ def test_a_broken_one_is_left_out_and_only_who_asks_for_it_is_refused(
         EFFECTS.load("glow")
     with pytest.raises(ConfigError, match=r"effects\.0: effect 'glow' of lab-light 1\.5"):
         load_scene(scene(tmp_path, 'kind = "glow"'))
+
+
+def test_what_its_module_prints_is_not_in_the_output(
+    install: Install, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """It came before the JSON of every command that imports it."""
+    install("lab-light", {"glow": "lab_light:Glow"}, f"print('hello')\n{GLOW}")
+    assert EFFECTS.load("glow").__name__ == "Glow"
+    said = capsys.readouterr()
+    assert (said.out, said.err) == ("", "hello\n")
 
 
 def test_our_names_stay_ours_and_a_name_of_two_is_nobodys(install: Install) -> None:

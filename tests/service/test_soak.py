@@ -6,6 +6,7 @@ from pathlib import Path
 
 from acquire.lines import ARMS
 from tools.soak import Soak, soak
+from tools.weeks import Life
 
 
 def test_every_line_is_accounted_for_and_memory_does_not_grow(tmp_path: Path) -> None:
@@ -27,3 +28,20 @@ def test_steady_growth_is_a_defect_and_fluctuation_is_not() -> None:
     found.memory["settling"] = [(second, 80.0 + min(second, 15)) for second in range(40)]
     found.judge()
     assert found.wrong == ["leaking: grew by 3.8 MB in the second half"]
+
+
+def test_what_1000_recordings_add_is_a_slope_of_the_second_half() -> None:
+    life = Life()
+    for number in range(40):
+        life.looks.append(
+            {
+                "recordings": 20.0 * number,
+                "memory_mb": 80.0 + min(number, 15) + 0.1 * (number % 2),
+                "objects": 1000.0 + 40 * number,
+                "descriptors": 20.0 + (number == 30),
+            }
+        )
+    slopes = life.slopes()
+    assert abs(slopes["memory_mb"]) < 0.1
+    assert abs(slopes["objects"] - 2000) < 1
+    assert slopes["descriptors"] == 0

@@ -9,15 +9,26 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from acquire.capacity.load import Load, recording_spec
 from acquire.clock import ClockFit
 from acquire.codes import PrbsCode
 from acquire.errors import DataError, PlaceError
 from acquire.lines import ARMS, LineBlock, LineFlag
-from acquire.store import RecordingSpec, RecordingWriter, RunCondition, open_recording, write_video
+from acquire.store import (
+    RecordingSpec,
+    RecordingWriter,
+    RunCondition,
+    format_of,
+    open_recording,
+    write_video,
+)
 from acquire.stream.tagger import Tagger
 from acquire.trigger.base import TriggerRun
+from acquire.web import archive as archive_module
 from acquire.web.archive import LINES_PER_ROW, LOST_COLOUR, PICTURE_ROWS, Archive, _arm_overview
 
+CLOCK = ClockFit(90_000_000, 0, 0)
+LOAD = Load(8, "uint16", 1000.0)
 M, LINES, WHITE = 6, LINES_PER_ROW * PICTURE_ROWS, 4095
 
 
@@ -84,3 +95,40 @@ def test_a_video_of_which_nothing_was_written_is_black(tmp_path: Path) -> None:
     found = Archive(tmp_path).video(path.name)
     assert (found.low, found.high) == (0.0, 1.0)
     assert Archive(tmp_path).frames(path.name, 0, 4) == bytes(frames.size)
+
+
+def test_lists_read_what_has_changed_and_remember_what_is_listed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Each list read the roots of all entries, every three seconds: with 1000, 0.3 cores."""
+    for number in range(3):
+        with RecordingWriter.create(tmp_path / f"run-{number}.zarr", recording_spec(LOAD, CLOCK)) as writer:
+            writer.seal(RunCondition.GOOD, "stopped", {})
+    frames = np.zeros((4, 6, 6), np.float32)
+    write_video(
+        tmp_path / "film.zarr", frames, np.arange(4), pixel_size=1.0, frame_interval_ns=1.0, provenance={}
+    )
+    read: list[str] = []
+
+    def noted(path: Path) -> str | None:
+        read.append(path.name)
+        return format_of(path)
+
+    monkeypatch.setattr(archive_module, "format_of", noted)
+    archive = Archive(tmp_path)
+    assert [(one.name, one.error) for one in archive.recordings()] == [
+        (f"run-{number}.zarr", None) for number in (2, 1, 0)
+    ]
+    assert len(read) == 4
+    read.clear()
+    assert [one.name for one in archive.videos()] == ["film.zarr"]
+    assert len(archive.recordings()) == 3
+    assert read == []
+    os.utime(tmp_path / "run-1.zarr/zarr.json", ns=(1, 1))
+    shutil.rmtree(tmp_path / "run-0.zarr")
+    shutil.rmtree(tmp_path / "run-2.zarr")
+    shutil.move(tmp_path / "film.zarr", tmp_path / "run-2.zarr")
+    assert [one.name for one in archive.recordings()] == ["run-1.zarr"]
+    assert set(read) == {"run-1.zarr", "run-2.zarr"}
+    assert set(archive._facts) == {"run-1.zarr"}
+    assert set(archive._kinds) == {"run-1.zarr", "run-2.zarr"}

@@ -13,6 +13,7 @@ from acquire.web.decimate import (
     BINS,
     LOST,
     MOST_COLUMNS,
+    MOST_ROWS_PER_S,
     MOST_UNSEEN_ROWS,
     SEEN,
     UNSEEN,
@@ -127,6 +128,36 @@ def test_the_histogram_counts_sampled_pixels() -> None:
 @pytest.mark.parametrize(("rate_hz", "line_bytes"), [(1000.0, 128), (33_333.0, 128), (1e5, 4640), (6e5, 54)])
 def test_the_rate_of_sampled_pixels_is_bounded(rate_hz: float, line_bytes: int) -> None:
     scale = Scale.of(rate_hz, line_bytes, 255)
-    assert rate_hz / scale.step <= 1000
+    assert rate_hz / scale.step <= MOST_ROWS_PER_S
     looked_at = rate_hz / scale.stride * line_bytes
     assert looked_at < 16e6 + rate_hz / scale.step * line_bytes
+    assert looked_at / scale.counted < 2e6
+
+
+@given(st.integers(1, 40), st.integers(MOST_COLUMNS - 3, 3 * MOST_COLUMNS), st.integers(1, 5))
+def test_a_column_has_the_extremes_of_its_pixels_for_any_width(count: int, width: int, step: int) -> None:
+    pixels = lines(3, count * step + 1, width)
+    decimator = Decimator(Scale(step, 1, WHITE), width)
+    put(decimator, 0, pixels)
+    rows = rows_of(decimator)
+    edges = np.arange(min(width, MOST_COLUMNS)) * width // min(width, MOST_COLUMNS)
+    whole = pixels[: count * step].reshape(count, step, width).astype(np.uint32) * 255 // WHITE
+    for shown, extreme in ((rows.low, np.minimum), (rows.high, np.maximum)):
+        by_row = extreme.reduce(whole, axis=1)
+        np.testing.assert_array_equal(shown[:count], extreme.reduceat(by_row, edges, axis=1))
+
+
+def test_the_histogram_counts_some_of_the_sampled_lines_whole_for_any_division_into_blocks() -> None:
+    pixels = lines(5, 90)
+    found = []
+    for cut in (90, 7):
+        decimator = Decimator(Scale(9, 3, WHITE, counted=2), 8)
+        for first in range(0, 90, cut):
+            put(decimator, first, pixels[first : first + cut])
+        put(decimator, 90, pixels[:9])
+        found.append(rows_of(decimator).histogram)
+    expected = np.bincount(pixels[::6].ravel().astype(np.int64) * BINS // (WHITE + 1), minlength=BINS)
+    expected += np.bincount(pixels[0].astype(np.int64) * BINS // (WHITE + 1), minlength=BINS)
+    expected += np.bincount(pixels[6].astype(np.int64) * BINS // (WHITE + 1), minlength=BINS)
+    np.testing.assert_array_equal(found[0], expected)
+    np.testing.assert_array_equal(found[1], expected)

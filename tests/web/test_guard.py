@@ -21,10 +21,11 @@ from acquire.config import load_rig
 from acquire.config.web import WebConfig
 from acquire.errors import ConfigError, PlaceError, UsageError
 from acquire.web import guard as guard_module
+from acquire.web import tokens as tokens_module
 from acquire.web.archive import Archive
 from acquire.web.guard import Buckets, Guard
 from acquire.web.server import address_of, link, names_of
-from acquire.web.tokens import COOKIE, Tokens, load_tokens
+from acquire.web.tokens import COOKIE, TokenFile, Tokens, load_tokens
 
 TOKENS = Tokens("o" * 32, "v" * 32)
 OPERATOR = {"Authorization": f"Bearer {TOKENS.operator}"}
@@ -107,6 +108,35 @@ def test_buckets_fill_again_and_are_bounded(monkeypatch: pytest.MonkeyPatch) -> 
     for k in range(100):
         buckets.take(str(k))
     assert len(buckets._buckets) == 10
+
+
+def test_tokens_that_were_changed_are_those_of_a_running_page(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    """The old ones stayed valid, and `acquire web --link` printed new ones that the page refused."""
+    monkeypatch.setattr(tokens_module, "LOOK_EVERY_S", 0.0)
+    path = tmp_path / "tokens"
+    page = TokenFile(path)
+    before = page.current
+    assert page.role_of_token(before.viewer) == "viewer"
+    path.unlink()
+    made = load_tokens(path)  # as `acquire web --link` does
+    assert page.role_of_token(made.operator) == "operator"
+    assert page.role_of_cookie(made.cookie("viewer")) == "viewer"
+    assert page.cookie("viewer") == made.cookie("viewer")
+    assert page.role_of_token(before.operator) is page.role_of_cookie(before.cookie("operator")) is None
+    path.unlink()
+    assert page.role_of_token(made.operator) is None
+    now = load_tokens(path)
+    assert page.current == now  # the page has made the file
+    path.unlink()
+    path.write_text("{}")
+    path.chmod(0o600)
+    assert page.current == now
+    assert "is not valid" in caplog.text
+    caplog.clear()
+    assert page.current == now
+    assert not caplog.text  # said once
 
 
 def test_tokens_are_made_once_for_their_owner_alone(tmp_path: Path) -> None:

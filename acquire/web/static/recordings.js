@@ -5,6 +5,8 @@ import { Player } from "./player.js";
 import { $, count, day, duration, fill, make, quantity } from "./words.js";
 
 const REFRESH_MS = 3000;
+/** The server lists only the newest (`archive.MOST_LISTED`). */
+const MOST_LISTED = 500;
 
 export class Recordings {
   #fail; #operator = false; #chosen = null; #detail = null; #from = 0; #lines = 0; #player; #timer = null; #refreshing = false; #shownError = "";
@@ -31,7 +33,8 @@ export class Recordings {
   }
 
   #list(recordings) {
-    fill($("recording-list"), JSON.stringify([recordings, this.#chosen]), () => recordings.length ? recordings.map((one) => {
+    const more = recordings.length < MOST_LISTED ? [] : [make("li", { className: "hint" }, `The newest ${MOST_LISTED} are shown; acquire ls lists all.`)];
+    fill($("recording-list"), JSON.stringify([recordings, this.#chosen]), () => recordings.length ? [...recordings.map((one) => {
       const lost = Object.values(one.lost_lines).reduce((sum, n) => sum + n, 0), state = one.error ? "DAMAGED" : one.condition ?? one.state;
       return make("li", {}, make("button", { id: `recording-${one.name}`, "aria-pressed": String(one.name === this.#chosen), onclick: () => this.#choose(one.name) },
         make("img", { src: one.error ? "" : `/api/recordings/${encodeURIComponent(one.name)}/picture?${one.lines}`, alt: "", loading: "lazy" }),
@@ -39,7 +42,7 @@ export class Recordings {
           make("small", { className: one.error || one.damage || lost || one.tainted_by.length ? "bad" : "" }, `${state}${lost ? `, ${count(lost)} lines lost` : ""}${one.held ? ", held" : ""}`),
           make("small", {}, one.error ?? `${count(one.lines)} lines, ${duration(one.duration_s)}, ${quantity(one.bytes, "B")}`),
           make("small", {}, [one.start_ns ? day(one.start_ns) : "", one.uploaded ? `copied to ${one.uploaded}` : ""].filter(Boolean).join("; ")))));
-    }) : [make("li", {}, "No recordings yet.")]);
+    }), ...more] : [make("li", {}, "No recordings yet.")]);
   }
 
   async #choose(name) {

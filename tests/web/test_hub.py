@@ -1,0 +1,49 @@
+"""All pages share one subscription to the daemon, and what is made of it."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+from collections.abc import Callable
+from pathlib import Path
+
+from fake_run import FakeRun, rig_config
+from served import api
+
+from acquire.client import AsyncClient
+from acquire.daemon.endpoint import Endpoint
+from acquire.daemon.service import Service
+from acquire.web.hub import Hub
+from acquire.web.live import RECORDING_TURN_S, TURN_S, Live
+
+
+def test_pages_get_the_same_message_and_fewer_pictures_during_a_recording(tmp_path: Path) -> None:
+    """For each page the state was encoded anew."""
+    service, socket = Service(rig_config(tmp_path), lambda _: FakeRun()), tmp_path / "c.sock"
+
+    async def until(condition: Callable[[], bool]) -> None:
+        async with asyncio.timeout(60):
+            while not condition():
+                await asyncio.sleep(0.01)
+
+    async def follow() -> None:
+        hub = Hub(socket, Live)
+        running = asyncio.create_task(hub.run())
+        client = AsyncClient(socket)
+        try:
+            await until(lambda: hub.connected)
+            first = hub.state_message()
+            assert hub.state_message() is first
+            assert hub.live.turn_s == TURN_S
+            await client.arm()
+            await client.start(tmp_path / "r.zarr")
+            await until(lambda: hub.is_recording)
+            assert b'"recording"' in hub.state_message()
+            assert hub.state_message() is not first
+            assert hub.live.turn_s == RECORDING_TURN_S
+        finally:
+            running.cancel()
+            await asyncio.gather(running, return_exceptions=True)
+
+    with contextlib.closing(Endpoint(socket)) as endpoint, api(service, endpoint):
+        asyncio.run(follow())
