@@ -82,7 +82,9 @@ def check(exposure: Exposure, known: Calibration, *, covered: bool = False) -> C
         corrected = found
         if known.alignment is not None:
             # as `align` corrected the calibration's own flat
-            quantities = without_field_edge(known.with_step(found), known.alignment.alignment)
+            # calibrations from before it was noted have a fall of the light if there was one
+            dimmed = bool(known.steps.get("align", {}).get("dimmed", "shading" in known.quantities))
+            quantities = without_field_edge(known.with_step(found), known.alignment.alignment, dimmed=dimmed)
             corrected = replace(found, quantities={**found.quantities, **quantities})
         compared = list(_columns(corrected, known, "gain", "1"))
         # The flats themselves, since an alignment may have corrected the balance of the calibration.

@@ -19,6 +19,7 @@ from acquire.calibrate.checks import (
     refuse_level,
     warn_of_drift,
     warn_of_exclusions,
+    warn_of_later_corrections,
     warn_of_level,
 )
 from acquire.calibrate.curve import straightened
@@ -163,6 +164,7 @@ def flat(
         *warn_of_level(exposure, light),
         *warn_of_drift(found),
         *warn_of_exclusions(usable | ~exposure.lit, "response"),
+        *warn_of_later_corrections(known),
     )
     return Finding("flat", exposure.instrument, quantities, usable, facts=facts, warnings=warnings)
 

@@ -125,6 +125,8 @@ def alignment(exposure: Exposure, known: Calibration) -> Finding:
         "lines_misfit": [round(still_a.misfit, 5), round(still_b.misfit, 5)],
         "brightness": round(match.brightness, 5),
         "shading_of_flat": known.steps["flat"].get("made") if shading else None,
+        "dimmed": match.fall_off.in_b,
+        "corrected": ["the lens's light" if name == "shading" else name for name in sorted(quantities)],
     }
     warnings = []
     if ends:
