@@ -122,7 +122,7 @@ def _quantities(quantities: Any) -> dict[str, str]:
         spread = " and ".join(f"{row.std():.2%}" for row in gain.value)
         facts["gain"] = (
             f"spread {spread} over the columns of a and b, each uncertain by "
-            f"{np.median(gain.uncertainty):.2%}"
+            f"{np.median(gain.uncertainty):.2%}, the worst by {gain.uncertainty.max():.2%}"
         )
     for name, (label, unit) in PER_ARM.items():
         if name in quantities:
