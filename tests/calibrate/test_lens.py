@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from instruments import COLUMNS, NOISE, dots, record, white
 
-from acquire.calibrate import Calibration, calibrated
+from acquire.calibrate import Calibration, calibrated, open_calibration, save_calibration
 from acquire.calibrate.apply import belongs_to_flat
 from acquire.calibrate.check import check
 from acquire.calibrate.choose import corrected
@@ -16,6 +16,7 @@ from acquire.calibrate.columns import dark, flat
 from acquire.calibrate.exposure import open_exposure
 from acquire.calibrate.target import alignment
 from acquire.calibrate.words import found_facts, known_facts
+from acquire.errors import DataError
 from acquire.reconstruct.explain import _without
 from acquire.store import open_recording
 
@@ -83,6 +84,16 @@ def test_a_repeated_flat_says_that_the_target_comes_next(taken: dict[str, Path],
     assert "repeat align" in again.warnings[-1]
     assert not belongs_to_flat(replace(lens, steps={**lens.steps, "flat": {"made": "2020-01-01T00:00"}}))
     assert "arm B lies" in found_facts(alignment(open_exposure(taken["target"]), lens.with_step(again)))
+
+
+def test_a_cut_file_names_what_is_damaged(lens: Calibration, tmp_path: Path) -> None:
+    """It said that an array was damaged, but not which, nor what to do."""
+    save_calibration(tmp_path / "cal.zarr", lens)
+    chunk = tmp_path / "cal.zarr" / "gain" / "c" / "0" / "0"
+    chunk.write_bytes(chunk.read_bytes()[:40])
+    with pytest.raises(DataError, match="gain of the calibration is damaged") as told:
+        open_calibration(tmp_path / "cal.zarr")
+    assert "measure it again" in told.value.hint
 
 
 def test_calibrations_from_before_the_lens_are_read(lens: Calibration) -> None:
