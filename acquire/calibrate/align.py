@@ -69,6 +69,13 @@ class FallOff:
         return bool(self._clear[2:].any())
 
     @property
+    def words(self) -> str:
+        """What the arms' images show of it."""
+        x, (r1, r2, c1, c2) = np.linspace(-1, 1, 65), self.terms
+        least = min(float(falling(pair, x).min()) for pair in ((r1, r2), (c1, c2)))
+        return f"the arms' images differ in the light on the field, by up to {1 - least:.0%} towards a side"
+
+    @property
     def _clear(self) -> NDArray[np.bool_]:
         return np.asarray(np.abs(self.terms) > np.maximum(LEAST_FALL, FALL_SURE * self.errors))
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from acquire.calibrate.apply import check_fits
 from acquire.calibrate.columns import dark, flat
-from acquire.calibrate.field import without_field_edge
+from acquire.calibrate.field import field_edge
 from acquire.calibrate.psf import psf
 from acquire.calibrate.target import alignment, orientation
 from acquire.errors import UsageError
@@ -82,8 +82,10 @@ def check(exposure: Exposure, known: Calibration, *, covered: bool = False) -> C
         corrected = found
         if known.alignment is not None:
             # as `align` corrected the calibration's own flat
-            quantities = without_field_edge(known.with_step(found), known.alignment.alignment)
-            corrected = replace(found, quantities={**found.quantities, **quantities})
+            # calibrations from before it was noted have a fall of the light if there was one
+            dimmed = bool(known.steps.get("align", {}).get("dimmed", "shading" in known.quantities))
+            edge = field_edge(known.with_step(found), known.alignment.alignment, dimmed=dimmed)
+            corrected = replace(found, quantities={**found.quantities, **edge.quantities})
         compared = list(_columns(corrected, known, "gain", "1"))
         # The flats themselves, since an alignment may have corrected the balance of the calibration.
         before = known.steps.get("flat", {}).get("part_a")

@@ -97,6 +97,14 @@ def warn_of_exclusions(usable: NDArray[np.bool_], reason: str) -> list[str]:
     return [f"{count} columns are left out for their {reason}"] if count else []
 
 
+def warn_of_later_corrections(known: Calibration) -> list[str]:
+    """Warn of a flat that replaces one which the target has corrected: the corrections are lost with it."""
+    lost = known.steps.get("align", {}).get("corrected", [])
+    if not lost:
+        return []
+    return [f"align has corrected {' and '.join(lost)} of the flat before this one: repeat align"]
+
+
 def per_arm(values: NDArray[np.float64]) -> list[float]:
     """Round values for JSON."""
     return [round(float(value), 6) for value in values]

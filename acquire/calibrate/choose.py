@@ -6,7 +6,7 @@ import os
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from acquire.calibrate.apply import blur_of, calibration_of, check_fits
+from acquire.calibrate.apply import belongs_to_flat, blur_of, calibration_of, check_fits
 from acquire.calibrate.calibration import Calibration, Instrument, differences_between
 from acquire.calibrate.curve import curve_of
 from acquire.calibrate.file import open_calibration
@@ -66,6 +66,8 @@ def corrected(known: Calibration) -> list[str]:
         found.append("arm B laid on arm A")
     if blur_of(known) is not None:
         found.append("the optics' blur")
+    if belongs_to_flat(known):
+        found.append("the lens's light")
     return found
 
 

@@ -19,6 +19,7 @@ from acquire.calibrate.checks import (
     refuse_level,
     warn_of_drift,
     warn_of_exclusions,
+    warn_of_later_corrections,
     warn_of_level,
 )
 from acquire.calibrate.curve import straightened
@@ -137,8 +138,7 @@ def flat(
     own_error = np.sqrt(np.maximum(found.own_variance, QUANTISATION_DN2) / found.lines[:, None])
     relative = np.hypot(own_error, known.quantities["offset_dn"].uncertainty)
     relative = relative / np.where(alive, light, np.inf)  # a column without light has no gain
-    # A fall-off at the outermost columns cannot be detected below the spread of the columns' own gains.
-    relative[:, [0, -1]] = np.hypot(relative[:, [0, -1]], _spread(shape, trusted) / np.sqrt(2))
+    relative[:, [0, -1]] = np.hypot(relative[:, [0, -1]], edge_doubt(shape, usable, edges)[:, None])
     gain = np.where(trusted, shape / level, 1.0)
     arm_error = np.sqrt((error**2).sum(axis=1)) / light.sum(axis=1)
     balance = arms / arms.mean()
@@ -163,6 +163,7 @@ def flat(
         *warn_of_level(exposure, light),
         *warn_of_drift(found),
         *warn_of_exclusions(usable | ~exposure.lit, "response"),
+        *warn_of_later_corrections(known),
     )
     return Finding("flat", exposure.instrument, quantities, usable, facts=facts, warnings=warnings)
 
@@ -206,6 +207,33 @@ def _blurred_edges(
         if count and float(lack[group].mean()) > max(TOGETHER * spread / np.sqrt(count), LEAST_LACK):
             hidden |= group
     return hidden
+
+
+def edge_doubt(
+    shape: NDArray[np.float64], usable: NDArray[np.bool_], dark: NDArray[np.bool_]
+) -> NDArray[np.float64]:
+    """Return for each arm the part of the light that its outermost columns may lack without being dark.
+
+    The spread of the columns' own gains hides it: what they lack together, all or those of the arm, is an
+    estimate of it as uncertain as the mean of so many gains.
+    """
+    outermost = np.zeros_like(usable)
+    outermost[:, [0, -1]] = True
+    inner = usable & ~outermost & ~dark
+    if not inner.any(axis=1).all():
+        return np.zeros(len(shape))
+    spread = _spread(shape, inner)
+    lack = 1 - shape / np.array([[np.median(row[good])] for row, good in zip(shape, inner, strict=True)])
+    witnesses = outermost & usable & ~dark
+
+    def doubt(group: NDArray[np.bool_]) -> float:
+        count = int(group.sum())
+        return float(np.hypot(max(0.0, lack[group].mean()), spread / np.sqrt(count))) if count else 0.0
+
+    together = doubt(witnesses)
+    return np.array(
+        [max(together, doubt(witnesses & arm[:, None])) for arm in np.eye(len(shape), dtype=bool)]
+    )
 
 
 def _spread(shape: NDArray[np.float64], usable: NDArray[np.bool_]) -> float:

@@ -82,10 +82,15 @@ def open_calibration(place: Path | str) -> Calibration:
         )
     try:
         group = zarr.open_group(source.zarr_store(), mode="r", zarr_format=3)
-        names = [name for name in QUANTITIES if name in group]
-        quantities = {name: Measured(_read(group, name), _read(group, name + UNCERTAINTY)) for name in names}
+        quantities, name = {}, "its list of arrays"
+        for name in [each for each in QUANTITIES if each in group]:
+            quantities[name] = Measured(_read(group, name), _read(group, name + UNCERTAINTY))
     except (GroupNotFoundError, *DAMAGE) as error:
-        raise DataError(f"{source}: an array of the calibration is damaged: {error}") from error
+        raise DataError(
+            f"{source}: {name} of the calibration is damaged: {error}",
+            possible="the copy that a recording carries, as acquire calibrate show RECORDING shows it",
+            hint="another copy of the calibration, or measure it again",
+        ) from error
     return Calibration.from_attrs(attributes, quantities)
 
 

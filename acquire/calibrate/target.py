@@ -11,7 +11,7 @@ from acquire.blur import falling
 from acquire.calibrate.align import Match, align
 from acquire.calibrate.apply import calibrated
 from acquire.calibrate.calibration import TERMS, Finding, Measured, TileAlignment
-from acquire.calibrate.field import without_field_edge
+from acquire.calibrate.field import field_edge
 from acquire.calibrate.orientation import (
     CLEAR,
     LEAST_CORRELATION,
@@ -24,6 +24,8 @@ from acquire.calibrate.still import stills
 from acquire.errors import UsageError
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
     from numpy.typing import NDArray
 
     from acquire.calibrate.calibration import Calibration
@@ -102,12 +104,12 @@ def alignment(exposure: Exposure, known: Calibration) -> Finding:
     # the shift is in blocks of S fine pixels
     match = align(still_a, still_b, geometry, (S * shift[0], S * shift[1]))
     # now that the alignment shows which columns of arm B look beyond the field
-    quantities = without_field_edge(known, match.found.alignment, dimmed=match.fall_off.in_b)
-    ends = bool(quantities)
+    edge = field_edge(known, match.found.alignment, dimmed=match.fall_off.in_b)
+    quantities = dict(edge.quantities)
     shading: dict[str, Measured] = {}
     if "gain" in known.quantities and not known.steps.get("flat", {}).get("smooth", True):
         corrected = replace(known, quantities={**known.quantities, **quantities})
-        if ends:
+        if edge.ends:
             # with the gains as they are now
             segment = _segment(exposure, replace(corrected, alignment=None))
             match = align(*stills(segment), geometry, (S * shift[0], S * shift[1]))
@@ -115,8 +117,8 @@ def alignment(exposure: Exposure, known: Calibration) -> Finding:
     if shading:
         match = replace(match, brightness=match.fall_off.brightness)
         quantities = {**quantities, **shading, **_balance(corrected, match)}
-    elif not ends:
-        quantities = _balance(known, match)
+    elif not edge.ends:
+        quantities |= _balance(known, match)
     facts = {
         **exposure.facts(),
         "lines": len(segment.time_ns),
@@ -125,9 +127,11 @@ def alignment(exposure: Exposure, known: Calibration) -> Finding:
         "lines_misfit": [round(still_a.misfit, 5), round(still_b.misfit, 5)],
         "brightness": round(match.brightness, 5),
         "shading_of_flat": known.steps["flat"].get("made") if shading else None,
+        "dimmed": match.fall_off.in_b,
+        "corrected": _corrected(known, quantities),
     }
     warnings = []
-    if ends:
+    if edge.ends:
         warnings.append(
             "the flat's light ends at the field's edge, and arm B sees beyond it: gain and balance are "
             "corrected, but a larger white scene is better"
@@ -141,6 +145,12 @@ def alignment(exposure: Exposure, known: Calibration) -> Finding:
         least = min(float(light.min()) for light in _lights(shading["shading"].value))
         warnings.append(
             f"the light falls to {least:.0%} towards a side, by lens or lamp: the model includes it"
+        )
+    elif match.fall_off.clear:
+        why = "a flat with --smooth has" if "flat" in known.steps else "without a flat there is"
+        warnings.append(
+            f"{match.fall_off.words}: {why} no profile of the lens, and the model does not include it; a "
+            "flat of a uniform scene without --smooth, and align after it, would"
         )
     return Finding(
         "align",
@@ -175,6 +185,8 @@ def tile_alignments(exposure: Exposure, known: Calibration) -> Finding:
         if match.misfit > UNLIKE:
             warnings.append(f"tile {tile}: the arms' images differ by {match.misfit:.0%} of their variation")
             continue
+        if match.fall_off.clear:
+            warnings.append(f"tile {tile}: {match.fall_off.words}; behind a fibre this is not corrected")
         found.append(TileAlignment(str(tile), segment.first_column, match.found))
     if not found:
         raise UsageError(
@@ -220,6 +232,16 @@ def _shading(known: Calibration, exposure: Exposure, match: Match) -> dict[str, 
         errors[arm] = [*sure, *columns, doubt[0]] if arm else [*rows, *sure, doubt[0]]
     gains_filled = Measured(filled.reshape(measured.value.shape), measured.uncertainty)
     return {"shading": Measured(values, errors), "gain": gains_filled}
+
+
+def _corrected(known: Calibration, quantities: Mapping[str, Measured]) -> list[str]:
+    """Return, in words, what differs from the values of the flat, not only in its uncertainty."""
+    changed = [
+        name
+        for name, each in sorted(quantities.items())
+        if name not in known.quantities or not np.array_equal(each.value, known.quantities[name].value)
+    ]
+    return ["the lens's light" if name == "shading" else name for name in changed]
 
 
 def _lights(shading: NDArray[np.float64]) -> list[NDArray[np.float64]]:

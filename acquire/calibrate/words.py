@@ -6,7 +6,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from acquire.calibrate.apply import CLEAR_BLUR
+from acquire.blur import falling
+from acquire.calibrate.apply import CLEAR_BLUR, belongs_to_flat
 from acquire.calibrate.calibration import Measured
 
 if TYPE_CHECKING:
@@ -82,6 +83,8 @@ def known_facts(known: Calibration) -> dict[str, Any]:
     if known.alignment is not None:
         facts |= _alignment(known.alignment)
     facts |= _tiles(known.tiles)
+    if "shading" in known.quantities and not belongs_to_flat(known):
+        facts["the lens's light"] = "not used: measured with another flat; repeat acquire calibrate align"
     for name, step in known.steps.items():
         facts[name] = f"{step.get('lines', 0)} lines, {step['made']}" + "".join(
             f"; {text}" for text in step.get("warnings", ())
@@ -119,13 +122,15 @@ def _quantities(quantities: Any) -> dict[str, str]:
         spread = " and ".join(f"{row.std():.2%}" for row in gain.value)
         facts["gain"] = (
             f"spread {spread} over the columns of a and b, each uncertain by "
-            f"{np.median(gain.uncertainty):.2%}"
+            f"{np.median(gain.uncertainty):.2%}, the worst by {gain.uncertainty.max():.2%}"
         )
     for name, (label, unit) in PER_ARM.items():
         if name in quantities:
             facts[label] = _both(quantities[name], unit)
     if "blur_px" in quantities:
         facts["the optics' blur"] = _blur(quantities["blur_px"])
+    if "shading" in quantities:
+        facts["the lens's light"] = _light(quantities["shading"])
     if "linearity_error" in quantities:
         error = quantities["linearity_error"]
         facts["linearity error"] = _both(Measured(100 * error.value, 100 * error.uncertainty), " %")
@@ -157,6 +162,18 @@ def _blur(measured: Measured) -> str:
             )
             widths.append(f"{arm} {axis} the transfer {width}")
     return "; ".join(widths) + " fine pixels (standard deviation)"
+
+
+def _light(measured: Measured) -> str:
+    """Describe what the darkest corner of each arm's image gets of the light, and its uncertainty."""
+    ends = np.array([-1.0, 1.0])
+    corners = []
+    for arm, (r1, r2, c1, c2, _), errors in zip("ab", measured.value, measured.uncertainty, strict=True):
+        rows, columns = falling((r1, r2), ends), falling((c1, c2), ends)
+        # the terms of an axis change a corner's light by as much as the other axis lets through
+        error = np.hypot(np.hypot(*errors[:2]) * columns.min(), np.hypot(*errors[2:4]) * rows.min())
+        corners.append(f"{arm} {rows.min() * columns.min():.1%} ± {error:.1%}")
+    return f"{', '.join(corners)} in the darkest corner, relative to the centre"
 
 
 def _both(measured: Measured, unit: str) -> str:

@@ -11,8 +11,9 @@ import math
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
-from acquire.calibrate import calibrated
-from acquire.calibrate.apply import blur_of
+from acquire.alignment import Alignment
+from acquire.calibrate import AlignmentFound, calibrated
+from acquire.calibrate.apply import belongs_to_flat, blur_of
 from acquire.calibrate.curve import curve_of
 from acquire.calibrate.orientation import MODEL, view_named
 from acquire.calibrate.psf import without_blur
@@ -26,7 +27,10 @@ if TYPE_CHECKING:
 
 ITERATIONS = 80
 MOST_LINES = 264
-OFFSETS, GAINS, CURVE = ("offset_dn", "ambient_dn"), ("gain",), ("excess_dn",)
+OFFSETS, CURVE = ("offset_dn", "ambient_dn"), ("excess_dn",)
+LIGHT = ("shading",)
+GAINS = ("gain", *LIGHT)
+"""The fall of the light is measured against the gains, and means nothing without them."""
 NOTHING, ALL = "nothing", "all of it"
 
 
@@ -113,6 +117,11 @@ def _without(known: Calibration) -> Iterator[tuple[str, Calibration]]:
     if known.orientation is not None and view_named(known.orientation) != MODEL:
         yield "the orientation", replace(known, orientation=None)
     if known.alignment is not None or known.tiles:
-        yield "arm B laid on arm A", replace(known, alignment=None, tiles=())
+        # the fall of the light needs an alignment, and is a part of its own
+        coinciding = AlignmentFound(Alignment(), {}) if belongs_to_flat(known) else None
+        yield "arm B laid on arm A", replace(known, alignment=coinciding, tiles=())
     if blur_of(known) is not None:
         yield "the optics' blur", without_blur(known)
+    if belongs_to_flat(known):
+        rest = {key: value for key, value in known.quantities.items() if key not in LIGHT}
+        yield "the lens's light", replace(known, quantities=rest)
