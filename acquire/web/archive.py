@@ -78,8 +78,26 @@ class Archive:
         return path
 
     def recordings(self) -> list[RecordingFacts]:
-        """Return the recordings, newest first."""
-        return [self._known_facts(path) for path in self._entries(video=False)]
+        """Return the recordings, newest first; from the cache if they are sealed and unchanged."""
+        listed = []
+        for path in self._entries(video=False):
+            try:
+                changed = (path / "zarr.json").stat().st_mtime_ns
+            except OSError:
+                changed = 0
+            key = (path.name, changed)
+            if (known := self._facts.get(key)) is None:
+                try:
+                    known = _facts(path, open_recording(path))
+                except AcquireError as error:
+                    known = RecordingFacts(name=path.name, error=shortened(error.message, 300))
+                except (*DAMAGE, MemoryError) as error:
+                    known = RecordingFacts(name=path.name, error=f"cannot be read: {shortened(error, 300)}")
+                # A recording that is being written changes more often than its root document does.
+                if known.state == "sealed":
+                    _remember(self._facts, key, known, 2 * MOST_LISTED)
+            listed.append(known)
+        return listed
 
     def recording(self, name: str) -> RecordingDetail:
         """Return a recording with its events, gaps and holds. Raises PlaceError and DataError."""
@@ -169,43 +187,22 @@ class Archive:
         for path in entries:
             try:
                 mode = path.lstat()
-                if path.suffix == ".zarr" and stat.S_ISDIR(mode.st_mode) and _is_video(path) is video:
-                    found.append((mode.st_mtime_ns, path))
+                if path.suffix != ".zarr" or not stat.S_ISDIR(mode.st_mode):
+                    continue
+                is_video = (format_of(path) or "").startswith(VIDEO)
+            except AcquireError:
+                is_video = False  # it is then listed among the recordings, with the error
             except OSError:
                 continue
+            if is_video is video:
+                found.append((mode.st_mtime_ns, path))
         return [path for _, path in sorted(found, reverse=True)[:MOST_LISTED]]
-
-    def _known_facts(self, path: Path) -> RecordingFacts:
-        """Return a recording's facts, from the cache if it is sealed and unchanged."""
-        try:
-            changed = (path / "zarr.json").stat().st_mtime_ns
-        except OSError:
-            changed = 0
-        key = (path.name, changed)
-        if (known := self._facts.get(key)) is None:
-            try:
-                known = _facts(path, open_recording(path))
-            except AcquireError as error:
-                return RecordingFacts(name=path.name, error=shortened(error.message, 300))
-            except (*DAMAGE, MemoryError) as error:
-                return RecordingFacts(name=path.name, error=f"cannot be read: {shortened(error, 300)}")
-            # A recording that is being written changes more often than its root document does.
-            if known.state == "sealed":
-                _remember(self._facts, key, known, 2 * MOST_LISTED)
-        return known
 
 
 def _remember(cache: OrderedDict[Any, Any], key: Any, value: Any, most: int) -> None:
     cache[key] = value
     while len(cache) > most:
         cache.popitem(last=False)
-
-
-def _is_video(path: Path) -> bool:
-    try:
-        return (format_of(path) or "").startswith(VIDEO)
-    except AcquireError:
-        return False  # it is then listed among the recordings, with the error
 
 
 def _facts(path: Path, opened: Recording) -> RecordingFacts:

@@ -177,6 +177,7 @@ class Decimator:
             row.high = row_high if row.high is None else np.maximum(row.high, row_high)
 
     def _eight_bits(self, row: NDArray[Any]) -> NDArray[np.uint8]:
+        # In 32 bits, which hold 255 times the largest value of 16 bits.
         scaled: NDArray[np.uint8] = (row.astype(np.uint32) * 255 // self._scale.white_dn).astype(np.uint8)
         return scaled
 

@@ -43,14 +43,18 @@ ADMITTED = (600.0, 60.0)
 """The same with a token, in a separate bucket: strangers behind the same address cannot exhaust it."""
 WRONG_TOKENS = (5.0, 0.2)
 """Burst and rate per second of wrong tokens from one address."""
+# With IPv6 one host has as many addresses as it likes, which must not fill the memory.
 MOST_ADDRESSES = 1024
 
 HEADERS = (
+    # Should foreign text, such as a mark's or a recording's name, become part of the page after all, it can
+    # neither run a script nor send anything to another host.
     (
         b"content-security-policy",
         b"default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data: blob:; "
         b"connect-src 'self'; form-action 'self'; frame-ancestors 'none'; base-uri 'none'",
     ),
+    # A recording's bytes are not taken for a script, whatever they look like.
     (b"x-content-type-options", b"nosniff"),
     (b"referrer-policy", b"no-referrer"),
     (b"cross-origin-resource-policy", b"same-origin"),
