@@ -320,9 +320,9 @@ def _tiff(path: Path, _: Layout, held: ExitStack) -> LineFile:
     series, *others = file.series
     # Samples of a pixel: the library calls an axis S for colours, and for what it takes for colours.
     if "S" in series.axes:
-        shape = " x ".join(map(str, series.shape))
+        found = " x ".join(map(str, series.shape))
         raise UsageError(
-            f"{path} holds pixels of several colours ({shape}, {series.axes})",
+            f"{path} holds pixels of several colours ({found}, {series.axes})",
             possible="grey pixels: (line, pixel), or (arm, line, pixel) with two arms",
             hint="the camera's raw values, saved as grey or in a .npy file",
         )

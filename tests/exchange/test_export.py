@@ -339,6 +339,7 @@ def test_times_choose_lines(cli: Cli, recording: Path, tmp_path: Path) -> None:
         (["run", "l.npy", "--lines", 0], "1 or more"),
         (["run", "l.npy", "--lines", 5, "--to", "1ms"], "given twice"),
         (["video", "v.npy", "--first-frame", 19, "--frames", 2], "possible: 0 to 19"),
+        (["video", "v.npy", "--first-frame", 99], "does not have frame 99"),
         (["video", "v.mp4", "--fps", 0], "0.1 to 240"),
         (["video", "v.mp4", "--peak", -1], "above 0"),
         (["nothing", "v.npy"], "does not exist"),
