@@ -176,7 +176,18 @@ def test_of_clients(name: str, tmp_path: Path) -> None:
         make(Client(tmp_path / "none.sock"))
 
 
-@pytest.mark.parametrize("place", ["http://[::1", "ftp://host:80", "http://host:99999", "http://"])
+@pytest.mark.parametrize(
+    "place",
+    [
+        "http://[::1",
+        "ftp://host:80",
+        "http://host:99999",
+        "http://",
+        f"http://{'a' * 64}",
+        "http://a..b:80",
+        "http://a\0b",
+    ],
+)
 def test_of_addresses(place: str) -> None:
     with pytest.raises(UsageError, match="is not a valid address; possible: http://HOST:PORT, or a socket"):
         Client(place)

@@ -173,6 +173,7 @@ def dark_edges(shape: NDArray[np.float64], usable: NDArray[np.bool_]) -> NDArray
     dark = np.zeros_like(usable)
     most = max(1, round(EDGE_SHARE * shape.shape[1]))
     for row, good, out in zip(shape, usable, dark, strict=True):
+        # By medians, which the dark columns that are looked for hardly change.
         middle = np.median(row[good])
         spread = 1.4826 * np.median(np.abs(row[good] - middle))
         low = row < middle - np.maximum(DARK_EDGE * spread, 2e-3 * middle)

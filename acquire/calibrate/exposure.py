@@ -119,7 +119,13 @@ def open_exposure(place: Path | str, first_line: int | None = None, lines: int |
     """
     recording = open_recording(place)
     first = recording.first_available_line if first_line is None else first_line
-    count = recording.first_line + recording.lines - first if lines is None else lines
+    end = recording.first_line + recording.lines
+    # Of a recording without lines, the number of lines below says enough.
+    if recording.lines and not recording.first_line <= first < end:
+        raise UsageError(
+            f"{recording} has no line {first}", possible=f"lines {recording.first_line} to {end - 1}"
+        )
+    count = end - first if lines is None else lines
     if count < FEWEST_LINES:
         raise UsageError(
             f"{recording} with {count} lines is too short to calibrate from",

@@ -98,13 +98,25 @@ def oriented(segment: Segment, view: View) -> Segment:
 
 
 def correlations(a: NDArray[Any], b: NDArray[Any]) -> dict[View, tuple[float, tuple[float, float]]]:
-    """Return for each view the correlation of camera B's image with camera A's, and its shift in pixels.
+    """Return for each view the largest correlation of camera B's image with camera A's, and its shift there.
 
-    Both images are (M, M) in their camera's own rows and columns. Mean and smooth parts are removed, because
-    different views of one lamp are alike in these.
+    The shift is that of B relative to A, in pixels. Both images are (M, M) in their camera's own rows and
+    columns. Mean and smooth parts are removed, because different views of one lamp are alike in these.
     """
-    left = _whitened(a)
-    return {view: _peak(left, _whitened(view.restored(b))) for view in VIEWS}
+    # padded to twice the size, so that shifted images do not wrap around
+    size = 2 * len(a)
+    shift = np.fft.fftfreq(size, 1 / size)
+    far = np.abs(shift) > FARTHEST * len(a)
+    # By the correlation theorem: the transform of a cross-correlation is conj(A)·B.
+    left = np.conj(np.fft.rfft2(_whitened(a), (size, size)))
+    found = {}
+    for view in VIEWS:
+        product = left * np.fft.rfft2(_whitened(view.restored(b)), (size, size))
+        correlation = np.fft.irfft2(product, (size, size))
+        correlation[far, :], correlation[:, far] = -1, -1
+        row, column = np.unravel_index(correlation.argmax(), correlation.shape)
+        found[view] = float(correlation[row, column]), (float(shift[row]), float(shift[column]))
+    return found
 
 
 def _whitened(image: NDArray[Any]) -> NDArray[np.float64]:
@@ -116,16 +128,3 @@ def _whitened(image: NDArray[Any]) -> NDArray[np.float64]:
     # the root, because two images are multiplied
     flat: NDArray[np.float64] = (rough - rough.mean()) * np.sqrt(np.outer(window, window))
     return flat / max(float(np.linalg.norm(flat)), 1e-30)
-
-
-def _peak(a: NDArray[np.float64], b: NDArray[np.float64]) -> tuple[float, tuple[float, float]]:
-    """Return the largest normalised cross-correlation, and the shift of ``b`` relative to ``a``."""
-    # padded to twice the size, so that shifted images do not wrap around
-    size = 2 * len(a)
-    product = np.conj(np.fft.rfft2(a, (size, size))) * np.fft.rfft2(b, (size, size))
-    found = np.fft.irfft2(product, (size, size))
-    shift = np.fft.fftfreq(size, 1 / size)
-    far = np.abs(shift) > FARTHEST * len(a)
-    found[far, :], found[:, far] = -1, -1
-    row, column = np.unravel_index(found.argmax(), found.shape)
-    return float(found[row, column]), (float(shift[row]), float(shift[column]))

@@ -26,8 +26,6 @@ from acquire.errors import UsageError
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from numpy.typing import NDArray
-
     from acquire.calibrate.calibration import Calibration
     from acquire.calibrate.exposure import Exposure
     from acquire.calibrate.still import Still
@@ -142,7 +140,9 @@ def alignment(exposure: Exposure, known: Calibration) -> Finding:
             "flat: the balance is corrected"
         )
     if shading:
-        least = min(float(light.min()) for light in _lights(shading["shading"].value))
+        x = np.linspace(-1, 1, 65)
+        terms = shading["shading"].value[:, :4].reshape(-1, 2)
+        least = min(float(falling((first, second), x).min()) for first, second in terms)
         warnings.append(
             f"the light falls to {least:.0%} towards a side, by lens or lamp: the model includes it"
         )
@@ -209,6 +209,7 @@ def _shading(known: Calibration, exposure: Exposure, match: Match) -> dict[str, 
         return {}
     r1, r2, c1, c2 = match.fall_off.terms
     rows, columns = match.fall_off.errors[:2], match.fall_off.errors[2:]
+    # A few lines, since of them only the order of arms and columns is needed.
     bare, measured = replace(exposure, lines=2).whole(), known.quantities["gain"]
     places = np.arange(measured.value.size, dtype=np.float64).reshape(measured.value.shape)
     # from 1, since a responsivity is above 0
@@ -242,11 +243,6 @@ def _corrected(known: Calibration, quantities: Mapping[str, Measured]) -> list[s
         if name not in known.quantities or not np.array_equal(each.value, known.quantities[name].value)
     ]
     return ["the lens's light" if name == "shading" else name for name in changed]
-
-
-def _lights(shading: NDArray[np.float64]) -> list[NDArray[np.float64]]:
-    x = np.linspace(-1, 1, 65)
-    return [falling(tuple(row[i : i + 2]), x) for row in shading for i in (0, 2)]
 
 
 def _balance(known: Calibration, match: Match) -> dict[str, Measured]:

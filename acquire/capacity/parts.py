@@ -119,6 +119,7 @@ def _pace_of_ring(load: Load, blocks: list[NDArray[Any]]) -> Pace:
     ring = Ring("capacity", RingShape(2, load.block_lines, load.pixels, load.dtype))
 
     def pass_through(k: int) -> int:
+        # Never full: each slot is released before the next one is claimed.
         slot = ring.claim()
         assert slot is not None
         slot.pixels[:] = blocks[k % len(blocks)]

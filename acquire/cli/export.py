@@ -153,6 +153,7 @@ def _frames_between(
     # A video without frames is refused below, whatever the times.
     first_ns, interval_ns = int(video.time_ns[0]) if total else 0, video.interval_ns
     low, high = (after_ns(text, lambda: first_ns) for text in (begin, end))
+    # Rounded up: a frame that began before the range is not one of it.
     start = 0 if low is None else math.ceil(low / interval_ns - ROUNDING)
     stop = total if high is None else math.ceil(high / interval_ns - ROUNDING)
     if not 0 <= start < stop <= total:

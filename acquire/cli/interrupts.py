@@ -122,16 +122,13 @@ def _acknowledge(number: int, doing: str) -> None:
     if number == signal.SIGINT:
         note(f"{doing}; press Ctrl-C again to end now")
     elif number == signal.SIGHUP:
-        _leave_terminal()
-
-
-def _leave_terminal() -> None:
-    """Write to no terminal any more: its end would be an error in the middle of putting things in order."""
-    nowhere = os.open(os.devnull, os.O_RDWR | os.O_CLOEXEC)
-    for fd in (1, 2):
-        if stat.S_ISCHR(os.fstat(fd).st_mode):
-            os.dup2(nowhere, fd)
-    os.close(nowhere)
+        # Nothing is written to the terminal any more: its end would be an error in the middle of putting
+        # things in order.
+        nowhere = os.open(os.devnull, os.O_RDWR | os.O_CLOEXEC)
+        for fd in (1, 2):
+            if stat.S_ISCHR(os.fstat(fd).st_mode):
+                os.dup2(nowhere, fd)
+        os.close(nowhere)
 
 
 def _end_now() -> None:

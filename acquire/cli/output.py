@@ -87,6 +87,7 @@ def fact_lines(facts: Mapping[str, Any]) -> list[str]:
 def line_width(*, err: bool = False) -> int:
     """Return the width of a line: that of the terminal, or COLUMNS for stdout; unlimited in a pipe."""
     terminal = (sys.stderr if err else sys.stdout).isatty()
+    # Shells set COLUMNS without exporting it: who has exported it asks for this width.
     requested = bool(os.environ.get("COLUMNS")) and not err
     return shutil.get_terminal_size().columns if terminal or requested else sys.maxsize
 

@@ -15,6 +15,7 @@ if TYPE_CHECKING:
 
 SOCKET = "c.sock"
 """Name of the control socket in a `private_directory`."""
+# The address of a Unix socket has room for 104 bytes on BSD and macOS, and 108 on Linux.
 LONGEST_SOCKET = 90
 """Longest path of a socket (bytes) that every system accepts."""
 

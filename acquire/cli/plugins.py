@@ -10,6 +10,7 @@ import typer
 from acquire.cli.output import JsonFlag, print_json, print_table, say
 from acquire.cli.usage import not_installed
 
+# In Python's own words: of a plug-in that failed, only the text of its error is kept.
 _MISSING = re.compile(r"No module named '([^.']+)")
 COLUMNS = ("kind", "name", "distribution", "version", "state")
 

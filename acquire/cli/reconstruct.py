@@ -190,7 +190,7 @@ def reconstruct(
     # A budget is the time of the whole command: the imports above count, too.
     began = time.monotonic() - _age_s()
     # Everything that can be wrong is checked before the solver runs.
-    _check_options(search, (workers, dask), anything_wanted=bool(out or auto or explain))
+    _check_options(search, iterations, (workers, dask), anything_wanted=bool(out or auto or explain))
     solver_options = parse_settings(settings or ())
     # Built here to be checked, and once more by every process that solves.
     open_solver(solver, solver_options)
@@ -253,7 +253,11 @@ def reconstruct(
 
 
 def _check_options(
-    search: str | None, where: tuple[int | None, str | None], *, anything_wanted: bool
+    search: str | None,
+    iterations: int | None,
+    where: tuple[int | None, str | None],
+    *,
+    anything_wanted: bool,
 ) -> None:
     if not anything_wanted:
         raise UsageError(
@@ -262,6 +266,9 @@ def _check_options(
         )
     if search not in SEARCHES:
         raise UsageError(f"there is no --search {search}", possible="each, shared")
+    # The solver refuses it, too, but only in processes whose start takes seconds.
+    if iterations is not None and iterations < 1:
+        raise UsageError(f"{iterations} iterations are not possible", possible="1 or more")
     if None not in where:
         raise UsageError(
             "--workers has no effect with --dask, whose cluster has workers of its own",

@@ -157,4 +157,5 @@ def _utc(time_ns: int | None) -> str:
         return "-"
     if not 0 <= time_ns < MOST_NS:
         return f"{time_ns} ns after 1970"
+    # To microseconds, which a float of seconds since 1970 still resolves.
     return datetime.fromtimestamp(time_ns / 1e9, UTC).strftime("%Y-%m-%d %H:%M:%S.%f")

@@ -67,6 +67,7 @@ def list_recordings(
 
     with refused(directory, "listed", "a directory of recordings; `acquire info` describes one"):
         named = sorted(path for path in directory.iterdir() if path.name.endswith(".zarr"))
+        # A recording was named itself, and not a directory of them.
         if (directory / "zarr.json").is_file():
             named = [directory.absolute()]  # "." has no name to list
     found = [facts for path in named if (facts := _summary(path)) is not None]

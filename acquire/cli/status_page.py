@@ -166,6 +166,7 @@ def _disk(disk: Facts | None) -> str | None:
     seconds, free = disk["seconds_to_full"], quantity(disk["free_bytes"], "B")
     left = f"{seconds:.0f} s"
     for unit, length_s in (("min", 60), ("h", 3600), ("days", 86400), ("years", 365.25 * 86400)):
+        # From two of a unit on: 90 min say more than 1.5 h.
         if (count := seconds / length_s) >= 2:
             # No exponent even for a disk that hardly fills, which lasts for thousands of years.
             left = f"{count:.3g} {unit}" if count < 999.5 else f"{count:.0f} {unit}"

@@ -24,9 +24,6 @@ from acquire.errors import TriggerError
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    import numpy as np
-    from numpy.typing import NDArray
-
     from acquire.trigger.device import Device
     from acquire.trigger.registers import TagRecord
 
@@ -83,7 +80,12 @@ def load(
 
     Example: [bold]acquire trigger load code.txt --url /dev/ttyUSB0[/]
     """
-    bits = _read_code(file)
+    from acquire.exchange import parse_code
+
+    # By an absolute path, since a name such as 0x1f would be read as the bits themselves.
+    code = parse_code(f"bits:{file.absolute()}")
+    assert isinstance(code, ListedCode)
+    bits = code.bits(0, code.length)
     with device_of(config, url, settings) as (driver, _):
         device = driver.device()
         begun_s = time.monotonic()
@@ -236,13 +238,3 @@ def _watch(device: Device, seconds: float | None) -> Iterator[TagRecord]:
                 return
         # Any valid request resets the watchdog, also while no tags come.
         device.status()
-
-
-def _read_code(file: Path) -> NDArray[np.uint8]:
-    """Read the bits of a code, each 0 or 1. Raises UsageError for other contents."""
-    from acquire.exchange import parse_code
-
-    # By an absolute path, since a name such as 0x1f would be read as the bits themselves.
-    code = parse_code(f"bits:{file.absolute()}")
-    assert isinstance(code, ListedCode)
-    return code.bits(0, code.length)

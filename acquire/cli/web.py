@@ -96,7 +96,7 @@ def _settings(
     from acquire.config.web import WebConfig
     from acquire.errors import UsageError
     from acquire.place import default_socket
-    from acquire.text import own_words
+    from acquire.text import own_words, shown
 
     # The daemon has validated these settings, and knows more than its rig file says (--set).
     if given is not None:
@@ -112,7 +112,10 @@ def _settings(
         try:
             settings = type(settings).model_validate({**settings.model_dump(), **changes})
         except ValidationError as error:
-            raise UsageError(own_words(error.errors()[0]["msg"])) from error
+            first = error.errors()[0]
+            # A rule about several settings has no place, and names them in its own words.
+            what = "".join(f"--{key} {shown(changes[key])}: " for key in first["loc"] if key in changes)
+            raise UsageError(what + own_words(first["msg"])) from error
     where = socket or (rig.control.socket if rig else default_socket())
     return where.absolute(), rig.recording.directory.absolute() if rig else None, settings
 

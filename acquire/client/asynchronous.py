@@ -165,7 +165,7 @@ class AsyncClient:
                 if len(rest) > core.MOST_LINE_BYTES:
                     raise NoDaemonError(f"the daemon on {self._target} sends a line of news that is too long")
                 for line in lines:
-                    for item in reader.take(line.decode().rstrip("\r")):
+                    for item in reader.take(line.decode(errors="replace").rstrip("\r")):
                         yield item
             if status >= core.BAD:
                 core.fact("events", Status).read(status, rest, self._target)
@@ -215,6 +215,7 @@ class AsyncClient:
                 event = http.next_event()
                 if event is h11.NEED_DATA:
                     async with asyncio.timeout(limit_s):
+                        # Nothing, at the end of the connection, makes h11 refuse an answer cut short.
                         http.receive_data(await reader.read(_READ_BYTES))
                 elif isinstance(event, h11.Response):
                     yield event.status_code
@@ -236,6 +237,7 @@ class AsyncClient:
         if target.socket is not None:
             # `connect` also checks who listens, and waits for a busy daemon: it must not block the loop.
             connection = await asyncio.to_thread(connect, target.socket, core.CONNECT_TIMEOUT_S)
+            # asyncio takes no blocking socket, and `connect` has given this one a timeout.
             connection.setblocking(False)
             return await asyncio.open_unix_connection(sock=connection)
         try:

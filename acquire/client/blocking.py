@@ -252,8 +252,10 @@ class Client:
                 if response.status >= core.BAD:
                     content = _content(response)
                     core.fact("events", Status).read(response.status, content, self._target)
+                # A longer line comes in pieces, none of which is whole JSON: it cannot fill the memory.
                 while line := response.readline(core.MOST_LINE_BYTES):
-                    yield from reader.take(line.decode().rstrip("\r\n"))
+                    # What is not UTF-8 is no news of ours either, and refused like other JSON.
+                    yield from reader.take(line.decode(errors="replace").rstrip("\r\n"))
             except (OSError, http.client.HTTPException) as error:
                 raise NoDaemonError(
                     f"the daemon on {self._target} has closed the connection while it was sending news"
@@ -295,6 +297,7 @@ class Client:
     def _connection(self, timeout_s: float) -> Iterator[http.client.HTTPConnection]:
         # The library would connect by TCP: it gets a socket that is connected already.
         connection = http.client.HTTPConnection("acquire")
+        # With a socket, it does not connect again either if the request breaks.
         connection.sock = self._connect()
         connection.sock.settimeout(timeout_s)
         try:

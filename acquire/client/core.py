@@ -54,6 +54,7 @@ API = "/api"
 BAD = 400
 """Lowest HTTP status that is an error."""
 
+# A line break in either of them would begin a header of its own.
 _ID = re.compile(rf"[!-~]{{1,{LONGEST_ID}}}")
 _TOKEN = re.compile(r"[ -~]+")
 
@@ -89,17 +90,20 @@ class Target:
             return cls(socket=default_socket() if place is None else Path(place).absolute())
         try:
             parts = urlsplit(text)
+            # As a connection will do, which passes on the UnicodeError of a name like "a..b".
+            name = (parts.hostname or "").encode("idna")
             port = parts.port or (443 if parts.scheme == "https" else 80)
         except ValueError:
             raise _no_address(text) from None
-        if not parts.hostname or parts.path.strip("/") or parts.query:
+        # A zero byte would end the name where C reads it.
+        if not name or b"\0" in name or parts.path.strip("/") or parts.query:
             raise _no_address(text)
         tls = parts.scheme == "https"
         token = token or os.environ.get(TOKEN_VARIABLE)
         if token is not None and not _fits(_TOKEN, token):
             # It is a secret, and not shown.
             raise UsageError("the token is not text that a header can hold", hint="acquire web --link")
-        return cls(None, parts.hostname, port, tls, token)
+        return cls(None, str(parts.hostname), port, tls, token)
 
     def __str__(self) -> str:
         if self.socket is not None:
@@ -111,6 +115,7 @@ class Target:
 
     def headers(self) -> dict[str, str]:
         """Return the headers of every request: the host name, which a page checks, and the token."""
+        # The colons of an IPv6 address are kept apart from that of the port (RFC 3986).
         host = f"[{self.host}]" if ":" in self.host else self.host
         headers = {"Host": host if self.socket is not None else f"{host}:{self.port}"}
         return headers | ({"Authorization": f"Bearer {self.token}"} if self.token else {})
@@ -253,12 +258,15 @@ class EventReader:
     def take(self, line: str) -> Iterator[News | Status | None]:
         """Take the next line, without its end, and yield what it completes; None: no more for now."""
         name, _, value = line.partition(":")
+        # By the standard of server-sent events, one space after the colon is no part of the value.
         value = value.removeprefix(" ")
+        # By the same standard a comment. The daemon sends one as a sign of life when it has no news.
         if line.startswith(":"):
             yield None
         elif name == "event":
             self._event = value
         elif name == "data":
+            # Data of several lines would have to be joined by line breaks; JSON comes in one.
             self._data += value
         elif not line and self._data:
             event, data = self._event, self._data

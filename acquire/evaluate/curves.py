@@ -145,6 +145,7 @@ def fit_sine(
         harmonics = _visible_harmonics(frequency_hz, interval_s, harmonics)
     coefficients, residual = _project(values, times_s, frequency_hz, harmonics)
     p, q = coefficients[1::2], coefficients[2::2]
+    # p·sin x + q·cos x = √(p² + q²)·sin(x + atan2(q, p))
     terms = [(float(a), float(phase)) for a, phase in zip(np.hypot(p, q), np.arctan2(q, p), strict=True)]
     (amplitude, phase_rad), *overtones = terms
     rms = float(np.sqrt(np.mean(np.square(residual))))
@@ -218,6 +219,7 @@ def _visible_harmonics(frequency_hz: float, interval_s: float, harmonics: int) -
             f"a sinusoid of {frequency_hz} Hz cannot be fitted to samples every {interval_s:g} s",
             possible=f"above 0 and below {nyquist_hz:g} Hz",
         )
+    # Of a whole ratio one less: that harmonic would be at half the sampling rate.
     return min(harmonics, int(np.ceil(nyquist_hz / frequency_hz)) - 1)
 
 

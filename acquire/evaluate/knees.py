@@ -104,7 +104,16 @@ def sentences(runs: Sequence[Run]) -> list[str]:
         return []
     name, end = f"{runs[0].solver}, {runs[0].preset}", float(curve.times_s[-1])
     cut = any(run.cut for run in runs)
-    found = [_sentence(knee, end) for knee in knees(curve, ended=not cut)]
+    found = []
+    for knee in knees(curve, ended=not cut):
+        if not knee.last:
+            then = f"; the next {plain(knee.seconds)} s add {_amount(knee.gain)}"
+        # What is left of the run is too short to gain anything.
+        elif end <= 1.02 * knee.seconds:
+            then = ", where the run ends"
+        else:
+            then = f"; the rest, to {plain(end)} s, adds {_amount(knee.gain)}"
+        found.append(f"{plain(knee.seconds)} s give {knee.value:.0f} dB{then}")
     best = int(np.argmax(curve.middle))
     if (lost := float(curve.middle[best] - curve.middle[-1])) >= LOST_DB:
         found.append(
@@ -119,15 +128,6 @@ def sentences(runs: Sequence[Run]) -> list[str]:
         f"the second half of that time gained {_amount(climbed)}"
     )
     return [f"{name}: {each}." for each in [*found, rest]]
-
-
-def _sentence(knee: Knee, end_s: float) -> str:
-    reached = f"{plain(knee.seconds)} s give {knee.value:.0f} dB"
-    if knee.last and end_s <= 1.02 * knee.seconds:
-        return f"{reached}, where the run ends"
-    if knee.last:
-        return f"{reached}; the rest, to {plain(end_s)} s, adds {_amount(knee.gain)}"
-    return f"{reached}; the next {plain(knee.seconds)} s add {_amount(knee.gain)}"
 
 
 def _amount(decibel: float) -> str:

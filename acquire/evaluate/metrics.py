@@ -67,8 +67,20 @@ def ssim_per_frame(
             possible=f"at least {window} x {window} pixels",
         )
     peak = checked_peak(truth, data_range)
+    c1, c2 = SSIM_K1**2, SSIM_K2**2
+    found = []
     # frame by frame, because the five filtered moments of a whole video would need five times its memory
-    return np.array([_ssim_frame(x, y, peak) for x, y in zip(video, truth, strict=True)])
+    for frame, true_frame in zip(video, truth, strict=True):
+        # in units of the range, so that c1 and c2 need no factor, and no square overflows
+        x, y = frame.astype(np.float64) / peak, true_frame.astype(np.float64) / peak
+        mx, my = _local_mean(x), _local_mean(y)
+        var_x, var_y = _local_mean(x * x) - mx * mx, _local_mean(y * y) - my * my
+        cov = _local_mean(x * y) - mx * my
+        luminance = (2 * mx * my + c1) / (mx * mx + my * my + c1)
+        # Eq. (13) of Wang et al., where c3 = c2 / 2 makes one factor of contrast and structure.
+        contrast_structure = (2 * cov + c2) / (var_x + var_y + c2)
+        found.append(np.mean(luminance * contrast_structure))
+    return np.array(found, np.float64)
 
 
 def check_pair(video: NDArray[Any], truth: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:
@@ -118,15 +130,3 @@ def _local_mean(image: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the Gaussian-weighted mean around each pixel whose window lies inside the image."""
     smooth: NDArray[np.float64] = gaussian_filter(image, SSIM_SIGMA, truncate=SSIM_TRUNCATE)
     return smooth[SSIM_RADIUS:-SSIM_RADIUS, SSIM_RADIUS:-SSIM_RADIUS]
-
-
-def _ssim_frame(video: NDArray[Any], truth: NDArray[Any], data_range: float) -> float:
-    # in units of the range, so that c1 and c2 need no factor, and no square overflows
-    x, y = video.astype(np.float64) / data_range, truth.astype(np.float64) / data_range
-    c1, c2 = SSIM_K1**2, SSIM_K2**2
-    mx, my = _local_mean(x), _local_mean(y)
-    var_x, var_y = _local_mean(x * x) - mx * mx, _local_mean(y * y) - my * my
-    cov = _local_mean(x * y) - mx * my
-    luminance = (2 * mx * my + c1) / (mx * mx + my * my + c1)
-    contrast_structure = (2 * cov + c2) / (var_x + var_y + c2)
-    return float(np.mean(luminance * contrast_structure))

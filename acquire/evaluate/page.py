@@ -55,6 +55,7 @@ def number(value: float | None, digits: int | None = None, *, signed: bool = Fal
     """
     if value is None:
         return "–"
+    # No plus before 0, which is neither more nor less.
     text = f"{value:{'+' if signed and value else ''},{'' if digits is None else f'.{digits}f'}}"
     if digits is None:
         text = text.removesuffix(".0")

@@ -122,6 +122,7 @@ def _curve(ax: Axes, repeats: list[Run], metric: Metric, clock: Clock, colour: s
         value = getattr(each.end, metric.name)
         if value is None:
             continue
+        # A run that was cut does not show what its preset can reach.
         marker = "x" if each.cut else MARKERS.get(each.preset, "o")
         at = getattr(each.end, clock), _shown(np.array([value]), metric)[0]
         ax.plot(*at, marker, color=colour, ms=6.5, mew=2, mfc="none" if exact else colour, zorder=4)

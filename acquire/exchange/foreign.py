@@ -121,7 +121,7 @@ def open_lines(path: Path, layout: Layout) -> Iterator[LineFile]:
             file = openers[kind](path, layout, held)
         except MALFORMED as error:
             raise UsageError(f"{path} cannot be read as {kind}: {error}") from error
-        shape = " x ".join(map(str, file.shape))
+        shape = " x ".join(map(str, file.shape)) or "of a single value"
         if len(file.shape) not in {2, 3} or 0 in file.shape or file.arms not in {1, 2}:
             raise UsageError(
                 f"{file.path} has the shape {shape}",
@@ -314,7 +314,18 @@ def _tiff(path: Path, _: Layout, held: ExitStack) -> LineFile:
     """Open a TIFF file: its pages are consecutive ranges of lines, and two channels are the arms."""
     tifffile = library("tifffile", "export", "a TIFF file")
     file = held.enter_context(tifffile.TiffFile(path))
+    # A file that was never completed has a header, and no image or one without pixels.
+    if not file.series or not file.series[0].shape:
+        raise UsageError(f"{path} is a TIFF file without an image", possible="one image of lines")
     series, *others = file.series
+    # Samples of a pixel: the library calls an axis S for colours, and for what it takes for colours.
+    if "S" in series.axes:
+        found = " x ".join(map(str, series.shape))
+        raise UsageError(
+            f"{path} holds pixels of several colours ({found}, {series.axes})",
+            possible="grey pixels: (line, pixel), or (arm, line, pixel) with two arms",
+            hint="the camera's raw values, saved as grey or in a .npy file",
+        )
     # Blocks that a program wrote one by one are several images to the library; thumbnails are no lines.
     alike = [each for each in others if (each.shape[-1], each.dtype) == (series.shape[-1], series.dtype)]
     if alike:

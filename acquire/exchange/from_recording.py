@@ -128,7 +128,7 @@ def _of_arms(recording: Recording, rows: range, name: str) -> Iterator[Block]:
             flags = flags_of(recording, arm, start, stop)
             values = flags if name == "flags" else present_values(recording, arm, name, start, flags)
             if rows.step > 1:
-                values = _all_flags(flags, rows.step) if name == "flags" else _means(values, flags, rows.step)
+                values = _groups(name, values, flags, rows.step)
             yield block((number, _place(rows, start, stop)), values)
 
 
@@ -164,19 +164,17 @@ def _place(rows: range, start: int, stop: int) -> slice:
     return slice((start - rows.start) // rows.step, -(-(stop - rows.start) // rows.step))
 
 
-def _all_flags(flags: NDArray[np.uint16], count: int) -> NDArray[np.uint16]:
-    """Combine the flags of each group of ``count`` lines; it has no image only if none of them has one."""
+def _groups(name: str, values: NDArray[Any], flags: NDArray[np.uint16], count: int) -> NDArray[Any]:
+    """Make one of every ``count`` lines, as `_long_group` does: all their flags, or the mean of their pixels.
+
+    A group has no image only if none of its lines has one; its mean is 0 then.
+    """
     edges = np.arange(0, len(flags), count)
-    found: NDArray[np.uint16] = np.bitwise_or.reduceat(flags, edges)
-    has_image = np.logical_or.reduceat((flags & NO_IMAGE) == 0, edges)
-    return np.where(has_image, found & ~np.uint16(NO_IMAGE), found)
-
-
-def _means(lines: NDArray[Any], flags: NDArray[np.uint16], count: int) -> NDArray[np.float32]:
-    """Return the mean of each group of ``count`` lines without those that have no image; 0 if none has."""
-    edges = np.arange(0, len(lines), count)
-    there = (flags & NO_IMAGE) == 0
+    has_image = (flags & NO_IMAGE) == 0
+    there = np.add.reduceat(has_image, edges, dtype=np.int64)
+    if name == "flags":
+        found = np.bitwise_or.reduceat(flags, edges)
+        return np.where(there > 0, found & ~np.uint16(NO_IMAGE), found)
     # In double, as in `_long_group`, so that both ways give the same mean.
-    total = np.add.reduceat(np.where(there[:, None], lines, 0), edges, axis=0, dtype=np.float64)
-    there = np.add.reduceat(there, edges, dtype=np.int64)
+    total = np.add.reduceat(np.where(has_image[:, None], values, 0), edges, axis=0, dtype=np.float64)
     return (total / np.maximum(there, 1)[:, None]).astype(np.float32)

@@ -38,8 +38,10 @@ def video_content(
     count = int(video.video.shape[0])
     frames = range(count) if frames is None else frames
     if not 0 <= frames.start < frames.stop <= count:
+        # From a first frame beyond the end, "to the end" would run backwards.
+        asked = f"frames {frames.start} to {frames.stop - 1}" if frames else f"frame {frames.start}"
         raise UsageError(
-            f"{title} does not have the frames {frames.start} to {frames.stop - 1}",
+            f"{title} does not have {asked}",
             possible=f"0 to {count - 1}",
         )
     trusted = video.trusted

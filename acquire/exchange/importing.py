@@ -178,28 +178,21 @@ def _checked(arms: Mapping[str, Arm], instrument: Instrument, most_lines: int | 
                 hint=f"--columns-{arm} FIRST:END, to select the lit pixels; --stages, to set their number",
             )
     lines = next(iter(counts.values()))
-    _check_code(instrument, lines)
-    _check_times(instrument, lines)
+    _check_span(instrument, lines)
     return lines
 
 
-def _check_code(instrument: Instrument, lines: int) -> None:
-    """Raise UsageError if the listed bits do not last for all sub-steps of the lines."""
+def _check_span(instrument: Instrument, lines: int) -> None:
+    """Raise UsageError if the lines outlast the code's listed bits, or ticks and times of 64 bits."""
     code = instrument.code
-    if not isinstance(code, ListedCode) or code.repeats:
-        return
     span = Geometry(instrument.stages, instrument.substeps, lines).span
     needed = instrument.code_start + instrument.substeps * instrument.first_line + span
-    if code.length < needed:
+    if isinstance(code, ListedCode) and not code.repeats and code.length < needed:
         raise UsageError(
             f"the code has {code.length} bits, and {lines} lines touch {needed}",
             possible="S·(M + lines) − 1 bits, starting with the first line's",
             hint="--code-repeats, if the sequence repeats, or fewer --lines",
         )
-
-
-def _check_times(instrument: Instrument, lines: int) -> None:
-    """Raise UsageError if the last lines' ticks or times do not fit into 64 bits."""
     ticks, seconds = MOST // (instrument.substep_ticks * instrument.substeps), MOST // 10**9
     most = min(ticks, int(seconds * instrument.line_rate_hz)) - lines - instrument.stages
     if instrument.first_line > most:

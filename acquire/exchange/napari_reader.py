@@ -18,7 +18,6 @@ from acquire.store import format_of, open_recording, open_video
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from acquire.store import Recording
 
 Layer = tuple[Any, dict[str, Any], str]
 SAMPLED = 5
@@ -75,15 +74,16 @@ def read_recording(path: Any) -> list[Layer]:
     """
     recording = open_recording(str(path))
     arms: list[Layer] = []
+    overviews: list[Layer] = []
     for number, arm in enumerate(ARMS):
         stack = pages(recording, arm)
         # `rgb` and `multiscale` are stated, since napari would guess them from the shape.
+        shown = {"contrast_limits": _limits(stack), "multiscale": False, "rgb": False}
+        column = number * (stack.shape[2] + GAP)
         options = {
+            **shown,
             "name": f"{_name(recording)}, arm {arm}",
-            "translate": [0, 0, number * (stack.shape[2] + GAP)],
-            "contrast_limits": _limits(stack),
-            "multiscale": False,
-            "rgb": False,
+            "translate": [0, 0, column],
             "metadata": {
                 "first_line": recording.first_line,
                 "lines_of_a_page": PAGE_LINES,
@@ -91,26 +91,18 @@ def read_recording(path: Any) -> list[Layer]:
             },
         }
         arms.append((stack, options, "image"))
-    overviews = [_overview(recording, arm, layer) for arm, layer in zip(ARMS, arms, strict=True)]
-    return [*(layer for layer in overviews if layer is not None), *arms]
-
-
-def _overview(recording: Recording, arm: str, lines: Layer) -> Layer | None:
-    found = recording.overview(arm)
-    if found is None:
-        return None
-    _, place, _ = lines
-    options = {
-        "name": f"{_name(recording)}, arm {arm}, overview ({found.lines_per_row} lines a row)",
-        # Without the axis of the pages, which the overview does not have.
-        "translate": place["translate"][1:],
-        "contrast_limits": place["contrast_limits"],
-        "visible": False,
-        "multiscale": False,
-        "rgb": False,
-        "metadata": {"first_line": found.first_line, "lines_per_row": found.lines_per_row},
-    }
-    return found.rows, options, "image"
+        if (found := recording.overview(arm)) is not None:
+            options = {
+                **shown,
+                "name": f"{_name(recording)}, arm {arm}, overview ({found.lines_per_row} lines a row)",
+                # Without the axis of the pages, which the overview does not have.
+                "translate": [0, column],
+                "visible": False,
+                "metadata": {"first_line": found.first_line, "lines_per_row": found.lines_per_row},
+            }
+            overviews.append((found.rows, options, "image"))
+    # napari draws later layers over earlier ones.
+    return [*overviews, *arms]
 
 
 def _name(path: object) -> str:

@@ -23,7 +23,6 @@ from acquire.reconstruct.arms import balance_of_recording
 from acquire.reconstruct.budget import Budget
 from acquire.reconstruct.sharing import SharedChoices, liveliest_first, sharing_facts
 from acquire.reconstruct.sheet import open_sheet
-from acquire.reconstruct.times import Times
 from acquire.reconstruct.work import Task
 from acquire.store.remote import is_url
 
@@ -109,9 +108,8 @@ def combine(
     budget = Budget(options.budget_s, called if began is None else began, pool.workers)
     # refused before anything is written
     budget.check(tasks, request.stream.geometry(1))
-    times, anchor = Times.of(recording), _anchor(recording, request)
     done: list[dict[str, Any]] = []
-    with open_sheet(out, request, times, anchor) as sheet:
+    with open_sheet(out, request, recording) as sheet:
         for part, task, following in _solved(tasks, pool, watcher, budget, SharedChoices(sharing)):
             if len(done) % len(segments) == 0:  # the first sub-segment of a tile
                 stitcher = Stitcher(grid)
@@ -183,14 +181,6 @@ def _result(waiting: deque[Future[Part]], pool: Pool, watcher: Watcher) -> Part 
         raise AcquireError(
             "a process that solved a sub-segment ended unexpectedly", hint="--workers 1: it may lack memory"
         ) from error
-
-
-def _anchor(recording: Recording, request: VideoRequest) -> tuple[int, int]:
-    """Return the sub-step at which the read-out of the stream's first line begins, and its UTC in ns."""
-    stream = request.stream
-    row = stream.first_line - recording.first_line
-    read_out_ns = int(recording.arms["a"].read("time", row, row + 1)[0])
-    return stream.substeps * stream.first_line + stream.geometry(1).readout_substep, read_out_ns
 
 
 def describe_parts(

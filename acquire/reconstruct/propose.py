@@ -87,27 +87,24 @@ def _tempos(
     """Return the tempo of every range: as examined, or that of the alike ones on both sides of it."""
     places = sorted({round(i * (count - 1) / max(1, PLACES - 1)) for i in range(PLACES)})
     known: dict[int, Tempo] = {}
+    kinds: dict[int, tuple[int, int]] = {}
+    # Stills differ by a line or two in length: all longer than the longest T_m of a moving scene are alike.
+    still = max(TEMPORAL_MERGES) + 1
     report = progress or (lambda _done, _of: None)
     waiting = deque(places)
     while waiting:
         place = waiting.popleft()
         known[place] = look(place, lambda share: report(len(known) + share, len(known) + 1 + len(waiting)))
+        voxels = known[place].voxels
+        kinds[place] = voxels.spatial_merge, min(voxels.temporal_merge, still)
         if not waiting:  # bisect between neighbours that differ
             waiting.extend(
                 (one + other) // 2
                 for one, other in pairwise(sorted(known))
-                if other - one > 1 and not _alike(known[one].voxels, known[other].voxels)
+                if other - one > 1 and kinds[one] != kinds[other]
             )
         report(len(known), len(known) + len(waiting))
     return [known[max(place for place in known if place <= number)] for number in range(count)]
-
-
-def _alike(one: Voxels, other: Voxels) -> bool:
-    """Whether two ranges need the same voxels; stills, which differ by a line or two in length, are alike."""
-    slow = max(TEMPORAL_MERGES)
-    # all longer than the longest T_m of a moving scene are stills
-    lengths = {min(voxels.temporal_merge, slow + 1) for voxels in (one, other)}
-    return one.spatial_merge == other.spatial_merge and len(lengths) == 1
 
 
 def _part(found: list[tuple[Stretch, Tempo]]) -> SegmentPlan:

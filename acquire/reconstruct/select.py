@@ -120,7 +120,9 @@ def by_lines(recording: Recording, first_line: int | None = None, lines: int | N
     end = whole.end_line if lines is None else first + lines
     if not whole.first_line <= first < end <= whole.end_line:
         possible = f"lines {whole.first_line} to {whole.end_line - 1}" if recording.lines else "no lines yet"
-        raise UsageError(f"lines {first} to {end - 1} of {recording} are not there", possible=possible)
+        # From a first line beyond the end, "to the end" would run backwards.
+        asked = f"line {first}" if lines is None else f"lines {first} to {end - 1}"
+        raise UsageError(f"{recording} does not have {asked}", possible=possible)
     return Selection(Stream(whole.stages, whole.substeps, first, end), Times.of(recording))
 
 

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 import numpy as np
 
 from acquire.recon.error import REGIONS
+from acquire.reconstruct.times import Times
 from acquire.store import MosaicWriter, VideoGrid, VideoWriter
 
 if TYPE_CHECKING:
@@ -18,7 +19,7 @@ if TYPE_CHECKING:
 
     from acquire.fibre import Tile
     from acquire.reconstruct.select import VideoRequest
-    from acquire.reconstruct.times import Times
+    from acquire.store import Recording
 
 
 class Sheet(Protocol):
@@ -46,11 +47,13 @@ class Sheet(Protocol):
 
 
 @contextmanager
-def open_sheet(
-    out: Path | str, request: VideoRequest, times: Times, anchor: tuple[int, int]
-) -> Iterator[Sheet]:
-    """Open the sheet of a video; without `Sheet.finish` nothing remains. ``anchor``: see `Times`."""
-    grid = request.grid
+def open_sheet(out: Path | str, request: VideoRequest, recording: Recording) -> Iterator[Sheet]:
+    """Open the sheet of a video of a recording; without `Sheet.finish` nothing remains."""
+    grid, stream, times = request.grid, request.stream, Times.of(recording)
+    row = stream.first_line - recording.first_line
+    # From the line's own time stamp: a clock that has drifted since the first line does not shift the video.
+    read_out_ns = int(recording.arms["a"].read("time", row, row + 1)[0])
+    anchor = (stream.substeps * stream.first_line + stream.geometry(1).readout_substep, read_out_ns)
 
     def utc_ns(first: int, stop: int) -> NDArray[np.int64]:
         # a frame's time is its beginning

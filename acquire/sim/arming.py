@@ -23,7 +23,7 @@ def check_configuration(get: Callable[[r.Register], int], locked: bool, code_che
     """Raise Refusal for the first setting that cannot be honoured. ``get`` reads a register."""
     if not locked:
         raise Refusal(ErrorCode.CLOCK_UNLOCKED, r.STATUS.address)
-    for checks in (_timing(get), _code(get, code_checked), _light(get), _outputs(get)):
+    for checks in (_timing(get), _code(get, code_checked), _outputs(get)):
         for failed, code, register in checks:
             if failed:
                 raise Refusal(code, register.address)
@@ -49,22 +49,21 @@ def _code(get: Callable[[r.Register], int], checked: bool) -> Iterator[_Check]:
     kind = r.CODE_SOURCE.kind.of(get(r.CODE_SOURCE))
     yield kind not in tuple(Source), ErrorCode.BAD_SOURCE, r.CODE_SOURCE
     if kind == Source.PRBS:
+        # A register of zeros stays one, and so does one without taps: neither makes a code.
         yield get(r.PRBS_MASK) == 0, ErrorCode.BAD_SEED, r.PRBS_MASK
         yield get(r.PRBS_SEED) == 0, ErrorCode.BAD_SEED, r.PRBS_SEED
     if kind == Source.MEMORY:
         length = get(r.CODE_LENGTH)
         yield not 0 < length <= get(r.CODE_BITS), ErrorCode.BAD_CODE_LENGTH, r.CODE_LENGTH
+        # Otherwise the checksum is that of another content, or of none.
         yield not checked, ErrorCode.CODE_UNCHECKED, r.CODE_LENGTH
 
 
-def _light(get: Callable[[r.Register], int]) -> Iterator[_Check]:
+def _outputs(get: Callable[[r.Register], int]) -> Iterator[_Check]:
     clocks, opens, closes = get(r.SUBSTEP_CLOCKS), get(r.WINDOW_OPEN), get(r.WINDOW_CLOSE)
     yield not opens < closes <= clocks, ErrorCode.BAD_WINDOW, r.WINDOW_CLOSE
     margin = r.LIMITS.lead_margin.of(get(r.LIMITS))
     yield r.LED.lead.of(get(r.LED)) + margin > clocks, ErrorCode.BAD_LEAD, r.LED
-
-
-def _outputs(get: Callable[[r.Register], int]) -> Iterator[_Check]:
     distance = pulse_distance(get)
     for enable, delay, width, code in (
         (r.TRIGGER_A, r.TRIGGER_A_DELAY, r.TRIGGER_A_WIDTH, ErrorCode.BAD_TRIGGER_A),

@@ -40,6 +40,7 @@ if TYPE_CHECKING:
 
     from acquire.codes import Code
 
+# The least that can be mapped.
 _PAGE = 4096
 _SEQUENCE = struct.Struct("@Q")  # native: one 8-byte store
 _RECORD = struct.Struct("@II")
@@ -118,6 +119,7 @@ class PulseTrain:
         """Return the pulses issued by ``now_ns``, including pulse 0 at the start; 0 before the start."""
         spacing = self.line_period_ns / self.speed
         elapsed_ns = now_ns - self.start_ns
+        # In whole numbers: a float would count a pulse too early or too late after some hours.
         pulses = elapsed_ns * spacing.denominator // spacing.numerator + 1 if elapsed_ns >= 0 else 0
         limits = [limit for limit in (self.stopped_after, self.budget) if limit is not None]
         return min(pulses, *limits) if limits else pulses
@@ -167,6 +169,7 @@ class Wire:
     """
 
     def __init__(self, clock: Clock | None = None) -> None:
+        # Only a child that is given the wire gets the descriptor, and not every program that is started.
         descriptor = os.memfd_create("acquire-wire", os.MFD_CLOEXEC)
         os.ftruncate(descriptor, _PAGE)
         self._attach(descriptor, clock or HostClock())

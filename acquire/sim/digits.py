@@ -88,7 +88,20 @@ class DigitScene(MaskScene):
     def intensity(self, first: int, count: int, substep_s: float | None = None) -> NDArray[np.float64]:
         """Return the intensity of each of the K segments: (K, count)."""
         step = (substep_s or self._substep_s) / self._period_s
-        light = {display: _digit_light(display, first, count, step) for display in self._displays}
+        light = {}
+        for display in self._displays:
+            loop = len(display.digits)
+            # by the loop's cycles, so that whole loops are dropped and the phase stays exact (`drives`)
+            begin = phase(first, count, step / loop, display.phase_deg / loop) * loop
+            # (digit, sub-step): time since each digit of the loop began, in periods
+            at = begin - np.arange(loop)[:, None]
+            # A sub-step may reach into the next loop, and may be longer than a whole one.
+            rounds = range(int(np.ceil(step / loop)) + 1)
+            areas = [
+                triangle_within(at + step - turn * loop) - triangle_within(at - turn * loop)
+                for turn in rounds
+            ]
+            light[display] = np.sum(areas, axis=0) / step
         return np.stack(
             [light[display][_shows(display, name)].sum(axis=0) for display, name in self.segments]
         )
@@ -97,22 +110,3 @@ class DigitScene(MaskScene):
 def _shows(display: DisplayConfig, name: str) -> NDArray[np.bool_]:
     """Return for each of the display's digits whether it lights the segment: (digit,)."""
     return np.array([name in SEGMENTS[int(digit)] for digit in display.digits])
-
-
-def _digit_light(display: DisplayConfig, first: int, count: int, step: float) -> NDArray[np.float64]:
-    """Return the mean light of every digit of the loop over each sub-step: (digit, count).
-
-    ``step`` is the duration of a sub-step in periods of a digit.
-    """
-    loop = len(display.digits)
-    # by the loop's cycles, so that whole loops are dropped and the phase stays exact (`drives`)
-    begin = phase(first, count, step / loop, display.phase_deg / loop) * loop
-    # (digit, sub-step): time since each digit of the loop began, in periods
-    at = begin - np.arange(loop)[:, None]
-    # A sub-step may reach into the next loop, and may be longer than a whole one.
-    rounds = range(int(np.ceil(step / loop)) + 1)
-    area = sum(
-        triangle_within(at + step - turn * loop) - triangle_within(at - turn * loop) for turn in rounds
-    )
-    mean: NDArray[np.float64] = np.asarray(area) / step
-    return mean

@@ -54,6 +54,7 @@ def mean_over(area: Callable[[Phase], Phase], begin: Phase, length: float) -> Ph
 
 def triangle_within(x: Phase) -> Phase:
     """Return the integral from 0 to x of a single triangle 0 → 1 → 0 on 0 … 1."""
+    # It rises by 2x to its top at 1/2: the area is x² up to there, and as much after it, 1/2 in all.
     inside = np.clip(x, 0, 1)
     area: Phase = np.where(inside < 0.5, inside**2, 0.5 - (1 - inside) ** 2)
     return area

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import runpy
+import traceback
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, Self
 
@@ -60,8 +61,11 @@ class FunctionScene:
 
     def frames_at(self, substeps: NDArray[np.int64]) -> NDArray[np.float32]:
         """(count, row, column) float32."""
-        light = self._function((substeps + 0.5) * self._substep_s, self._row, self._column)
         name = f"function {getattr(self._function, '__name__', repr(self._function))}"
+        try:
+            light = self._function((substeps + 0.5) * self._substep_s, self._row, self._column)
+        except Exception as error:  # the user's own code may raise anything
+            raise _raised(name, error) from error
         frames = checked_light(light, (len(substeps), self.size, self.size), name)
         # A shutter covers frames in place, and the function may have returned an array that it keeps.
         return frames.copy()
@@ -86,6 +90,15 @@ def checked_light(light: Any, shape: tuple[int, ...], what: str) -> NDArray[np.f
     return frames
 
 
+def _raised(what: str, error: Exception) -> UsageError:
+    """Return the error for an exception of the user's own code, with the line that led to it."""
+    frames = traceback.extract_tb(error.__traceback__)
+    # Not a line of a library that this code has called.
+    own = [each for each in frames if "-packages" not in each.filename] or frames
+    place = f"{own[-1].filename}, line {own[-1].lineno}"
+    return UsageError(f"{what} raised {type(error).__name__} in {place}: {error}")
+
+
 def load_function(name: str) -> LightFunction:
     """Import ``module:name`` or run ``file.py:name``. Raises UsageError if there is no such function."""
     # from the right: a path may contain colons
@@ -98,6 +111,8 @@ def load_function(name: str) -> LightFunction:
             found = getattr(importlib.import_module(place), attribute, None)
     except (ImportError, OSError, SyntaxError) as error:
         raise UsageError(f"scene function {name!r} cannot be loaded: {error}") from error
+    except Exception as error:  # as above: a file is run, and a module imported
+        raise _raised(f"scene function {name!r}", error) from error
     if not callable(found):
         raise UsageError(f"scene function {name!r} cannot be loaded: {place} has no function {attribute}")
     return found  # type: ignore[no-any-return]

@@ -191,6 +191,7 @@ class FrameLines:
         S, n = self._substeps, self._scene.size
         # ``packets`` is laid out as the kernel traverses the frames; ``gathered`` is a view of it that is
         # always (along the moving charge, across it).
+        # n more than the lines need: the last frames also begin packets of the next lines.
         packets = np.zeros((S * count + n, self._width) if self._along_rows else (n, S * count + n))
         gathered = packets if self._along_rows else packets.T
         begin, end = S * first_line, S * (first_line + count) + n - 1
@@ -202,6 +203,7 @@ class FrameLines:
             self._gather(packets, S * first_line, first, min(self._block, end - first))
         self._unfinished = gathered[S * count :].copy()
         self._next_line = first_line + count
+        # An arm that sees the scene mirrored counts its columns the other way.
         whole = gathered[: S * count, :: 1 if self._columns[0] <= self._columns[-1] else -1]
         merged = np.zeros((count, self._width // S))
         for u, c in np.ndindex(S, S):

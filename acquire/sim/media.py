@@ -100,6 +100,7 @@ class VideoScene:
 
     def frames_at(self, substeps: NDArray[np.int64]) -> NDArray[np.float32]:
         """(count, row, column) float32."""
+        # The middle of a sub-step stands for its mean light.
         position = (substeps + 0.5) * self._frames_per_substep
         before = np.floor(position).astype(np.int64)
         part = (position - before).astype(np.float32)
@@ -127,6 +128,7 @@ class VideoScene:
 
 def open_media(path: Path) -> Source:
     """Return the frames of a file, read by the first library that can."""
+    # `is_file` is False for what is not there, and raises for what may not be looked at.
     try:
         there = path.is_file()
     except PermissionError as error:
@@ -166,19 +168,17 @@ def resample(picture: Light, size: int) -> Light:
 
     The pixels of a picture smaller than ``size`` become squares.
     """
-    rows, columns = (_weights(length, size) for length in picture.shape)
-    resampled: Light = rows @ picture @ columns.T
+    weights = []
+    for length in picture.shape:
+        # (size, length): the fraction of new pixel i that old pixel j covers
+        new = np.arange(size + 1) * (length / size)
+        low = np.maximum(new[:-1, None], np.arange(length))
+        high = np.minimum(new[1:, None], np.arange(1, length + 1))
+        covered = np.clip(high - low, 0, None)
+        weights.append((covered / covered.sum(axis=1, keepdims=True)).astype(np.float32))
+    # Rows and columns separately: a pixel's area is the product of its two sides.
+    resampled: Light = weights[0] @ picture @ weights[1].T
     return resampled
-
-
-def _weights(length: int, size: int) -> Light:
-    """Return the fraction of new pixel i that old pixel j covers: (size, length)."""
-    new = np.arange(size + 1) * (length / size)
-    low = np.maximum(new[:-1, None], np.arange(length))
-    high = np.minimum(new[1:, None], np.arange(1, length + 1))
-    covered = np.clip(high - low, 0, None)
-    weights: Light = (covered / covered.sum(axis=1, keepdims=True)).astype(np.float32)
-    return weights
 
 
 def _square(picture: Light, fit: str) -> Light:
@@ -258,6 +258,7 @@ class _ArrayFile:
 
 def _version(path: Path) -> tuple[int, int, int]:
     """Return what tells a file from one that has replaced it or was written anew."""
+    # The time alone may be that of the file that it has replaced.
     found = path.stat()
     return found.st_ino, found.st_size, found.st_mtime_ns
 

@@ -90,6 +90,7 @@ class PinPage:
     def publish(self, run: PinRun, light: bytes, clock_hz: int) -> None:
         """Publish the state of a run; ``light`` has one byte per sub-step that ended since the last call."""
         header = self._header
+        # Odd until the end: who reads meanwhile tries again.
         header[_SEQUENCE] += np.uint64(1)
         # The light of a new run is written from the beginning of the page again.
         done = 0 if run.number != header[_RUN] else int(header[_SUBSTEPS])

@@ -228,6 +228,7 @@ class Merged(Camera):
         S = self._substeps
         raw = self._raw.read(S * first_line, S * count)
         blocks = raw.pixels.reshape(count, S, -1, S)
+        # The sum of S² samples of 16 bits does not fit into their own type.
         merged = blocks.sum(axis=(1, 3), dtype=np.uint32)
         # a raw sample that is full has lost light, which its sum would not show
         white = blocks.max(axis=(1, 3)) >= self._raw_white_dn

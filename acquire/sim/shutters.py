@@ -44,6 +44,7 @@ class ShutteredScene:
 
     def frames_at(self, substeps: NDArray[np.int64]) -> NDArray[np.float32]:
         """(count, row, column) float32."""
+        # In place, since a scene's frames are a new array each time (`Scene.frames`).
         frames = frames_at(self._scene, substeps)
         for shutter in self._shutters:
             shutter.cover(frames, substeps)

@@ -93,6 +93,7 @@ class _Sprite:
         self._picture = (picture * config.level).astype(np.float32)
         self._alpha = alpha.astype(np.float32)
         covered = np.argwhere(alpha > 0) - (len(alpha) - 1) / 2
+        # A picture that is transparent throughout covers nothing, of which there is no maximum.
         # a texel more, to which interpolation reaches
         self._reach_texels = float(np.hypot(*covered.T).max(initial=0)) + 1
 
@@ -116,6 +117,7 @@ class _Sprite:
         paste(frames, self._picture, self._alpha, places, scale, self._reach_texels / scale)
 
     def _turns(self, substeps: NDArray[np.int64], rate_hz: float, phase_deg: float) -> Grid:
+        # Without whole turns, beside which the fraction would lose its digits in a long run.
         turns: Grid = ((substeps + 0.5) * (rate_hz * self._substep_s) + phase_deg / 360) % 1.0
         return turns
 

@@ -89,6 +89,7 @@ class TriggerModel:
             r.START_TIME: lambda: self._run.start_tick if self._run.lines else 0,
             r.LINES: lambda: self._run.lines,
             r.CODE_STATE: self._code_state,
+            # Counters of 32 bits start at 0 again, as in the gateware.
             r.TAG_COUNT: lambda: self._run.made & _WORD,
             r.TAG_LOST: lambda: self._run.lost & _WORD,
             r.TAG_FIFO: lambda: r.TAG_FIFO.pack(fill=len(self._tags), peak=self._run.peak),
@@ -327,6 +328,7 @@ class TriggerModel:
         flags = TagFlag.LAST | _ENDS.get(reason, TagFlag(0))
         self._queue_tag(self._record(run.lines, tick, flags if run.lines else flags | TagFlag.NO_LINES))
         now_ns = self._wire.clock.monotonic_ns()
+        # From here on at the host's speed, but without a jump: the trigger's time only grows.
         self._zero = (now_ns, self._tick_at(now_ns), Fraction(1))
 
     def _queue_line_tags(self, first: int, end: int) -> None:

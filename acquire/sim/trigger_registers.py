@@ -24,6 +24,7 @@ SUBSTEP_MIN = 5
 SUBSTEP_MAX_LOG2 = 24
 LEAD_MARGIN = 1
 INPUTS = ("pps", "external_arm")
+# The divisors of the six sub-phases of a line's transfer (`arming`).
 _SUBSTEPS = (1, 2, 3, 6)
 _REGISTER_AT = {register.address + i: register for register in r.REGISTERS for i in range(register.words)}
 

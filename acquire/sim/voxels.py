@@ -41,6 +41,7 @@ def truth(
         frames = scene.frames(first_substep + offset, min(block, count - offset))
         voxel = np.arange(offset, offset + len(frames)) // temporal_merge
         begins = np.flatnonzero(np.diff(voxel, prepend=-1))
+        # Not by reshaping: the last voxel of an axis may be narrower than the others.
         summed = np.add.reduceat(frames, starts, axis=1, dtype=np.float64)
         summed = np.add.reduceat(summed, starts, axis=2) / (extent[:, None] * extent)
         summed = np.add.reduceat(summed, begins, axis=0)

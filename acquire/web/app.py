@@ -73,6 +73,7 @@ class Reading:
     """One thread for all work that waits for the disk, with a limited number of waiting requests."""
 
     def __init__(self) -> None:
+        # One, because `Archive` is for one thread at a time.
         self._thread = ThreadPoolExecutor(1, thread_name_prefix="reading")
         self._waiting = 0
 
@@ -127,6 +128,7 @@ def build_page(
 
     @app.get("/", include_in_schema=False)
     async def index() -> FileResponse:
+        # The browser asks whether it has changed: after an update an old page would load new scripts.
         return FileResponse(STATIC / "index.html", headers={"Cache-Control": "no-cache"})
 
     app.mount("/static", StaticFiles(directory=STATIC), name="static")

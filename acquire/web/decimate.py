@@ -199,6 +199,7 @@ class Decimator:
         return reduced
 
     def _eight_bits(self, rows: NDArray[Any]) -> NDArray[np.uint8]:
+        # In 32 bits, which hold 255 times the largest value of 16 bits.
         scaled: NDArray[np.uint8] = (rows.astype(np.uint32) * 255 // self._scale.white_dn).astype(np.uint8)
         return scaled
 

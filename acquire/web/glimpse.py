@@ -100,6 +100,7 @@ class Glimpses:
         pairs = zip(ranges, self._columns, strict=True)
         samples = np.stack([each[0][:, columns] for each, columns in pairs if each is not None])
         flags = np.stack([each[1] for each in ranges if each is not None])
+        # A saturated sample tells only that there was at least so much light.
         usable: NDArray[np.bool_] = samples < config.cameras.a.white_dn
         usable[(flags & NO_IMAGE) != 0] = False
         geometry = config.geometry.segment(lines)
@@ -185,24 +186,20 @@ def main() -> None:
         over.set()
 
     threading.Thread(target=end_with_owner, daemon=True).start()
-    with limit_threads(1):
-        _serve(over)
-
-
-def _serve(over: threading.Event) -> None:
     out = sys.stdout.buffer
-    while not over.is_set():
-        try:
-            for glimpse in glimpses(Client(Path(sys.argv[1])), over.is_set):
-                if glimpse:
-                    out.write(glimpse)
-                    out.flush()
-                else:
-                    over.wait(LOOK_AGAIN_S)
-        except AcquireError:  # the run or the daemon has ended; either may come back
-            over.wait(LOOK_AGAIN_S)
-        except BrokenPipeError:
-            return
+    with limit_threads(1):
+        while not over.is_set():
+            try:
+                for glimpse in glimpses(Client(Path(sys.argv[1])), over.is_set):
+                    if glimpse:
+                        out.write(glimpse)
+                        out.flush()
+                    else:
+                        over.wait(LOOK_AGAIN_S)
+            except AcquireError:  # the run or the daemon has ended; either may come back
+                over.wait(LOOK_AGAIN_S)
+            except BrokenPipeError:
+                return
 
 
 if __name__ == "__main__":

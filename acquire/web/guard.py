@@ -43,14 +43,18 @@ ADMITTED = (600.0, 60.0)
 """The same with a token, in a separate bucket: strangers behind the same address cannot exhaust it."""
 WRONG_TOKENS = (5.0, 0.2)
 """Burst and rate per second of wrong tokens from one address."""
+# With IPv6 one host has as many addresses as it likes, which must not fill the memory.
 MOST_ADDRESSES = 1024
 
 HEADERS = (
+    # Should foreign text, such as a mark's or a recording's name, become part of the page after all, it can
+    # neither run a script nor send anything to another host.
     (
         b"content-security-policy",
         b"default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data: blob:; "
         b"connect-src 'self'; form-action 'self'; frame-ancestors 'none'; base-uri 'none'",
     ),
+    # A recording's bytes are not taken for a script, whatever they look like.
     (b"x-content-type-options", b"nosniff"),
     (b"referrer-policy", b"no-referrer"),
     (b"cross-origin-resource-policy", b"same-origin"),
@@ -123,16 +127,26 @@ class Guard:
 
     def _refusal(self, request: Request) -> JSONResponse | None:
         address = request.client.host if request.client else ""
-        if _host_of(request.headers.get("host", "")) not in self._names:
-            host = shortened(request.headers.get("host", ""))
-            return _refuse(421, f"the page is not served under the name {host}", "web.names")
+        host = request.headers.get("host", "").strip().lower()
+        # Without the port, and without the brackets of an IPv6 address: ::1 for [::1]:8300.
+        name = host.rpartition(":")[0] if host.count(":") == 1 else host
+        if host.startswith("["):
+            name = host[1:].partition("]")[0]
+        if name not in self._names:
+            shown = shortened(request.headers.get("host", ""))
+            return _refuse(421, f"the page is not served under the name {shown}", "web.names")
         # Requests with a token have their own bucket: strangers behind the same proxy cannot lock them out.
         bucket = self._requests if self.role_of(request) is None else self._admitted
         if not bucket.take(address):
             return _refuse(429, "too many requests came from this address", "again in a second")
         if not request.url.path.startswith(API):
             return None
-        if request.method not in SAFE and not _is_same_origin(request):
+        # Browsers state where a request comes from; scripts do not, and pass. In two headers, because
+        # browsers that do not send the first send the second with all unsafe requests.
+        site = request.headers.get("sec-fetch-site", "same-origin")
+        origin = request.headers.get("origin")
+        same = origin is None or origin.partition("://")[2].lower() == request.headers.get("host", "").lower()
+        if request.method not in SAFE and not (same and site in ("same-origin", "none")):
             return _refuse(403, "the request comes from a page of another site")
         if request.url.path in OPEN:
             return None
@@ -175,23 +189,6 @@ class Guard:
     def note_wrong(self, address: str) -> None:
         self._wrong.take(address)
         log.warning("a wrong token from %s", address)
-
-
-def _host_of(header: str) -> str:
-    """Return the host of a Host header, in lower case and without a port; ::1 for [::1]:8300."""
-    text = header.strip().lower()
-    if text.startswith("["):
-        return text[1:].partition("]")[0]
-    return text.rpartition(":")[0] if text.count(":") == 1 else text
-
-
-def _is_same_origin(request: Request) -> bool:
-    """Return whether the browser states the page's own origin; scripts state none, and pass."""
-    # Two headers, because browsers that do not send the first send the second with all unsafe requests.
-    site = request.headers.get("sec-fetch-site", "same-origin")
-    origin = request.headers.get("origin")
-    same = origin is None or origin.partition("://")[2].lower() == request.headers.get("host", "").lower()
-    return same and site in ("same-origin", "none")
 
 
 def _refuse(status: int, text: str, hint: str = "") -> JSONResponse:

@@ -175,6 +175,7 @@ class Jobs:
             env=os.environ
             | {"ACQUIRE_SOCKET": str(self._socket), "ACQUIRE_BY": job.by, OWNER: str(os.getpid())},
             stdin=asyncio.subprocess.DEVNULL,
+            # The result is a file. A pipe that nobody reads would fill, and the command wait for ever.
             stdout=asyncio.subprocess.DEVNULL,
             stderr=asyncio.subprocess.PIPE,
             limit=MOST_LINE_BYTES,

@@ -81,6 +81,7 @@ class Live:
 
     def after(self, number: int) -> tuple[int, list[bytes]]:
         """Return the next number, and the messages from ``number`` on that are still kept."""
+        # A deque to which the thread appends while it is walked through raises RuntimeError.
         with self._lock:
             return self._count, [content for k, content in self._messages if k >= number]
 

@@ -8,6 +8,7 @@ from pydantic import Field
 
 from acquire.daemon.messages import Message, Text
 
+# The largest whole number up to which those of JavaScript are exact.
 MOST_LINES = 2**53
 
 
@@ -108,6 +109,7 @@ class JobRequest(Message):
     """Long-running work on a recording."""
 
     kind: Literal["reconstruct", "preview", "cut"]
+    # No file system of Linux has longer names.
     recording: str = Field(max_length=255)
     first_line: int = Field(strict=True, ge=0, le=MOST_LINES)
     lines: int = Field(strict=True, ge=1, le=2**24)

@@ -25,6 +25,7 @@ if TYPE_CHECKING:
 
 NICE = 10
 IDLE_S = 5
+# The streams of open pages never end on their own: a longer wait would only delay the end.
 GRACE_S = 1
 # More than the open pages can hold (`page_stream.MOST_PAGES`), which leaves some for their other requests.
 MOST_CONNECTIONS = 64
@@ -40,7 +41,17 @@ def serve_page(socket: Path, directory: Path, config: WebConfig) -> None:
     stand_back(NICE, EARLY)
     raise_descriptor_limit()
     tokens = TokenFile(config.token_path(socket))
-    context = _tls(config)
+    context = None
+    if config.certificate is not None:
+        context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
+        context.minimum_version = ssl.TLSVersion.TLSv1_2  # earlier versions are deprecated (RFC 8996)
+        try:
+            context.load_cert_chain(config.certificate, config.key)
+        except (OSError, ssl.SSLError) as error:
+            raise UsageError(
+                f"web.certificate {config.certificate} and its key cannot be used: {error}",
+                possible="PEM files",
+            ) from error
     with contextlib.closing(_listen(config)) as listener:
         log.info("the operator's page: %s (the token: acquire web --link)", address_of(config, listener))
         asyncio.run(_serve(socket, directory, tokens, config, listener, context))
@@ -57,6 +68,7 @@ async def _serve(
     page = build_page(socket, directory, tokens, names_of(config), secure=context is not None)
     settings = uvicorn.Config(
         page,
+        # Its own configuration would replace the handlers of this process.
         log_config=None,
         access_log=False,
         server_header=False,
@@ -135,17 +147,3 @@ def _listen(config: WebConfig) -> sockets.socket:
             hint="choose another web.port, or 0 for any free port",
         ) from error
     return listener
-
-
-def _tls(config: WebConfig) -> ssl.SSLContext | None:
-    if config.certificate is None:
-        return None
-    context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
-    context.minimum_version = ssl.TLSVersion.TLSv1_2  # earlier versions are deprecated (RFC 8996)
-    try:
-        context.load_cert_chain(config.certificate, config.key)
-    except (OSError, ssl.SSLError) as error:
-        raise UsageError(
-            f"web.certificate {config.certificate} and its key cannot be used: {error}", possible="PEM files"
-        ) from error
-    return context

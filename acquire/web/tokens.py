@@ -26,6 +26,7 @@ if TYPE_CHECKING:
 Role = Literal["operator", "viewer"]
 ROLES: tuple[Role, ...] = ("operator", "viewer")
 COOKIE = "acquire_session"
+# 192 random bits, which base64 writes as 32 characters: guessing them is hopeless even without a limit.
 _TOKEN_BYTES = 24
 _MOST_BYTES = 4096
 LOOK_EVERY_S = 1.0
@@ -150,6 +151,7 @@ def _read_tokens(path: Path) -> Tokens:
         f"the token file {path} is not valid", hint="delete it, and a new one will be created"
     )
     try:
+        # A link could lead to somebody else's file, and a named pipe would wait for who writes into it.
         file = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK)
     except OSError as error:
         raise UsageError(

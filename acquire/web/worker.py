@@ -28,6 +28,7 @@ def main() -> None:
     # Its death before this call is not reported any more, but has given this process another parent.
     if os.getppid() != int(os.environ.get(OWNER, os.getppid())):
         return
+    # In this process, whose number the page has: its signals reach the command itself.
     os.execv(sys.executable, [sys.executable, "-m", "acquire", *sys.argv[1:]])  # noqa: S606 - ourselves
 
 

@@ -76,6 +76,7 @@ def test_a_failed_check_names_what_has_changed(cli: Cli, taken: dict[str, Path],
         (("orientation", "dark"), "constant code"),
         (("align", "target", "--lines", 60), "complete lines do not determine"),
         (("dark", "dark", "--lines", 3), "too short"),
+        (("dark", "dark", "--first-line", 99_999), "has no line 99999"),
     ],
 )
 def test_impossible_requests_are_refused_and_leave_nothing_behind(

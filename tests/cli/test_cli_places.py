@@ -302,3 +302,10 @@ def test_a_rendering_needs_a_name(cli: Cli, out: str) -> None:
     answer = cli("render", "video.zarr", "--out", out)
     assert answer.code == 2, answer.err
     assert f"{out} cannot be rendered: its name has no suffix" in answer.err
+
+
+def test_a_port_that_does_not_exist_is_named_with_its_option(cli: Cli) -> None:
+    """pydantic's words alone did not say which value they are about."""
+    answer = cli("web", "--link", "--port", 99_999)
+    assert answer.code == 2
+    assert "--port 99999: " in answer.err

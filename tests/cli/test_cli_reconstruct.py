@@ -232,6 +232,7 @@ def test_a_video_is_written_to_a_url_and_rendered_from_it(cli: Cli, recording: P
     ("words", "said"),
     [
         (("--lines", 10_000), "possible: lines 0 to 299"),
+        (("--first-line", 10_000), "does not have line 10000"),
         (("--from", "soon"), "500ms"),
         (("--from", "1ms", "--to", "1s"), "1ms to 1s (sub-steps"),
         (("--voxels", "3"), "NMxTM"),
@@ -261,6 +262,12 @@ def test_impossible_requests_are_refused(
     assert answer.code == 2
     assert said in answer.err.lower() or said in answer.err
     assert list(tmp_path.iterdir()) == []
+
+
+def test_too_few_iterations_are_refused_before_anything_is_opened(cli: Cli, tmp_path: Path) -> None:
+    """They were refused by the processes that solve, whose start takes seconds."""
+    answer = cli("reconstruct", tmp_path / "none.zarr", "--out", tmp_path / "v.zarr", "--iterations", 0)
+    assert "0 iterations are not possible" in answer.err
 
 
 def test_a_budget_uses_the_learned_presets(

@@ -242,6 +242,33 @@ def test_daemon_that_answers_strangely(
         thread.join(300)
 
 
+@pytest.mark.parametrize(
+    "ask",
+    [
+        lambda socket: next(Client(socket).events()),
+        lambda socket: asyncio.run(anext(aiter(AsyncClient(socket).events()))),
+    ],
+    ids=["blocking", "async"],
+)
+def test_news_that_are_no_text(path: Path, ask: Callable[[Path], object]) -> None:
+    odd = path.with_name("odd.sock")
+    odd.unlink(missing_ok=True)
+    with socket.socket(socket.AF_UNIX) as listener:
+        listener.bind(str(odd))
+        listener.listen(1)
+
+        def reply() -> None:
+            with listener.accept()[0] as connection:
+                connection.recv(4096)
+                connection.sendall(b"HTTP/1.1 200 OK\r\n\r\nevent: news\ndata: {\xff}\n\n")
+
+        thread = threading.Thread(target=reply)
+        thread.start()
+        with pytest.raises(AcquireError, match="another version"):
+            ask(odd)
+        thread.join(300)
+
+
 TREE = [
     kind for kind in vars(errors).values() if isinstance(kind, type) and issubclass(kind, errors.AcquireError)
 ]

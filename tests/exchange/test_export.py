@@ -312,9 +312,9 @@ def test_damaged_lines_are_left_out_of_averages() -> None:
     damaged, missing = LineFlag.INCOMPLETE, LineFlag.MISSING
     lines = np.repeat(np.arange(1, 9, dtype=np.uint16)[:, None], 3, axis=1)
     flags = np.array([LineFlag.SATURATED, damaged, 0, 0, damaged, damaged, missing, damaged], np.uint16)
-    means = from_recording._means(lines, flags, 2)
+    means = from_recording._groups("lines", lines, flags, 2)
     np.testing.assert_array_equal(means, np.repeat([[1.0], [3.5], [0.0], [0.0]], 3, axis=1))
-    assert from_recording._all_flags(flags, 2).tolist() == [
+    assert from_recording._groups("flags", flags, flags, 2).tolist() == [
         LineFlag.SATURATED, 0, damaged, missing | damaged,
     ]  # fmt: skip
 
@@ -339,6 +339,7 @@ def test_times_choose_lines(cli: Cli, recording: Path, tmp_path: Path) -> None:
         (["run", "l.npy", "--lines", 0], "1 or more"),
         (["run", "l.npy", "--lines", 5, "--to", "1ms"], "given twice"),
         (["video", "v.npy", "--first-frame", 19, "--frames", 2], "possible: 0 to 19"),
+        (["video", "v.npy", "--first-frame", 99], "does not have frame 99"),
         (["video", "v.mp4", "--fps", 0], "0.1 to 240"),
         (["video", "v.mp4", "--peak", -1], "above 0"),
         (["nothing", "v.npy"], "does not exist"),

@@ -141,3 +141,31 @@ def test_a_code_is_its_own_once_it_is_read(tmp_path: Path) -> None:
     code = parse_code(f"bits:{path}")
     path.write_bytes(b"")
     assert code.bits(0, 4).tolist() == [1, 0, 1, 1]
+
+
+@pytest.mark.parametrize("compression", ["zlib", None])
+def test_a_colour_picture_is_refused_as_such(tmp_path: Path, compression: str | None) -> None:
+    """Without compression its pixels, of three samples each, were taken for lines of three pixels."""
+    path = tmp_path / "colour.tif"
+    tifffile.imwrite(path, np.zeros((64, 32, 3), np.uint8), compression=compression, photometric="rgb")
+    with pytest.raises(UsageError, match="several colours") as caught, open_lines(path, Layout()):
+        pass
+    assert "64 x 32 x 3" in str(caught.value)
+
+
+@pytest.mark.parametrize("first_page", [0, 8])
+def test_a_tiff_file_without_an_image_is_refused_as_such(tmp_path: Path, first_page: int) -> None:
+    """A program that was ended while it wrote leaves a header, and a page without tags or none."""
+    path = tmp_path / "begun.tif"
+    path.write_bytes(b"II*\0" + first_page.to_bytes(4, "little") + bytes(6))
+    with pytest.raises(UsageError, match="without an image"), open_lines(path, Layout()):
+        pass
+
+
+def test_a_single_value_is_refused_with_a_complete_sentence(tmp_path: Path) -> None:
+    np.save(tmp_path / "one.npy", np.uint8(3))
+    with (
+        pytest.raises(UsageError, match="shape of a single value"),
+        open_lines(tmp_path / "one.npy", Layout()),
+    ):
+        pass

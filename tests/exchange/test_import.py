@@ -293,14 +293,14 @@ def test_a_file_that_was_cut_short_leaves_nothing(
 ) -> None:
     """While it is being read: its size was right at first."""
     files = as_npy(tmp_path, lines)
-    checked = importing._check_code
+    checked = importing._check_span
 
     def shrink(*words: Any) -> None:
         checked(*words)
         with files[1].open("r+b") as file:
             file.truncate(1000)
 
-    monkeypatch.setattr(importing, "_check_code", shrink)
+    monkeypatch.setattr(importing, "_check_span", shrink)
     code, _, err = cli("import", *files, *SIZES, "--out", tmp_path / "again.zarr")
     assert (code, "it was cut short" in err) == (6, True), err
     assert sorted(tmp_path.iterdir()) == sorted(files)

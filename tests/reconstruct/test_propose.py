@@ -6,7 +6,7 @@ from acquire.config.scene import ConstantDrive, SineDrive
 from acquire.recon.auto import Tempo
 from acquire.recon.segments import Voxels
 from acquire.reconstruct import by_lines
-from acquire.reconstruct.propose import PLACES, _alike, _tempos, propose
+from acquire.reconstruct.propose import PLACES, _tempos, propose
 from acquire.sim.leds import LedConfig, LedSceneConfig
 from acquire.simulate import simulate
 from acquire.store import open_recording
@@ -53,6 +53,14 @@ def test_a_long_recording_is_examined_in_some_places_and_where_it_changes():
 
 
 def test_stills_of_other_lengths_are_alike():
-    assert len(_tempos(50, lambda number, _: Tempo(Voxels(1, 770 + number % 3), ((0, 0.1),)), None)) == 50
-    assert not _alike(Voxels(1, 770), Voxels(1, 64))
-    assert _alike(Voxels(1, 770), Voxels(1, 767))
+    looked: list[int] = []
+
+    def look(lengths):
+        looked.clear()
+        return lambda number, _: looked.append(number) or Tempo(Voxels(1, lengths[number % 2]), ((0, 0.1),))
+
+    assert len(_tempos(50, look((770, 767)), None)) == 50
+    assert len(looked) == PLACES
+    # A moving scene among them is looked for, however long its frames.
+    _tempos(50, look((770, 64)), None)
+    assert len(looked) > PLACES

@@ -125,6 +125,21 @@ def test_values_that_no_line_can_be_sent_with_are_refused_and_change_nothing() -
             camera.turn()
 
 
+def test_a_request_that_is_cut_off_and_packets_without_room_do_not_end_the_camera() -> None:
+    tap = Tap()
+    with bench(43, tap) as (host, camera, address):
+        for flags in (1, 0x11):  # frame ids of 16 bits, and of 64
+            packet = struct.pack(">BBHHH", protocol.KEY, flags, protocol.Command.RESEND, 4, 1) + bytes(4)
+            host.sendto(packet, (address, protocol.PORT))
+            camera.turn()
+        size = struct.pack(">II", protocol.PACKET_SIZE, protocol.IP_AND_UDP_BYTES + 8)
+        assert ask(host, camera, address, protocol.Command.WRITE_REGISTER, size)[0] == 0
+        assert write(host, camera, address, "Height", HEIGHT) == 0
+        assert write(host, camera, address, "AcquisitionStart", 1) == 0
+        while not tap.frames:
+            camera.turn()
+
+
 def test_a_frame_states_the_column_at_which_its_lines_begin() -> None:
     tap = Tap()
     with bench(42, tap) as (host, camera, address):

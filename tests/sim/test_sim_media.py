@@ -162,11 +162,23 @@ def test_invalid_files_are_refused_when_they_are_opened(tmp_path, name, words):
         shown(tmp_path / name)
 
 
+WRONG = r"function wrong raised NameError in .*wave\.py, line 7: name 'brightness' is not defined"
+
+
+def test_a_users_file_that_fails_is_named_with_its_line(tmp_path):
+    """Its traceback, through our own code and its imports, was all that a user saw."""
+    (tmp_path / "wave.py").write_text("RATE_HZ = 5e3\nPERIOD_S = 1 / (RATE_HZ - 5000)\n")
+    (tmp_path / "scene.toml").write_text('kind = "function"\nfunction = "wave.py:wave"\n')
+    with pytest.raises(UsageError, match=r"raised ZeroDivisionError in .*wave\.py, line 2: "):
+        build_scene(load_scene(tmp_path / "scene.toml"), 5, 1e-4)
+
+
 def test_a_users_function_in_a_file_next_to_the_scene(tmp_path):
     (tmp_path / "wave.py").write_text(
         "import numpy as np\n"
         "def wave(t, row, column):\n    return 0.5 + 0.5 * np.sin(6*row + 0*column + 1e3*t[:,None,None])\n"
         "def flat(t, row, column):\n    return np.ones((3, 3))\n"
+        "def wrong(t, row, column):\n    return brightness * t\n"
         "def nan(t, row, column):\n    return np.full((len(t), row.size, column.size), np.nan)\n"
     )
     scene_file = tmp_path / "scene.toml"
@@ -174,7 +186,12 @@ def test_a_users_function_in_a_file_next_to_the_scene(tmp_path):
     frames = build_scene(load_scene(scene_file), 5, 1e-4).frames(2, 3)
     expected = 0.5 + 0.5 * np.sin(6 * 0.3 + 0.1 * np.arange(2.5, 5))
     np.testing.assert_allclose(frames[:, 1, 4], expected, rtol=1e-5)
-    for name, words in (("flat", r"shape \(3, 3\)"), ("nan", "NaN"), ("none", "no function none")):
+    for name, words in (
+        ("flat", r"shape \(3, 3\)"),
+        ("nan", "NaN"),
+        ("none", "no function none"),
+        ("wrong", WRONG),
+    ):
         scene_file.write_text(f'kind = "function"\nfunction = "wave.py:{name}"\n')
         with pytest.raises(UsageError, match=words):
             build_scene(load_scene(scene_file), 5, 1e-4)

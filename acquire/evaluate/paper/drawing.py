@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
-    from numpy.typing import NDArray
+    from numpy.typing import ArrayLike, NDArray
 
     Rows = Sequence[tuple[str, NDArray[Any]]]
 
@@ -35,6 +35,15 @@ def strip(name: str, caption: str, rows: Rows, stamps: Sequence[str], peak: floa
     """Draw rows of frames at the same instants, one per column; narrow pages get fewer columns."""
     narrow = strips(rows, stamps, peak, across=NARROW_ACROSS, width_in=NARROW_IN)
     return Picture(name, strips(rows, stamps, peak), caption, narrow=narrow)
+
+
+def compared(
+    name: str, caption: str, video: NDArray[Any], *, truth: NDArray[Any], picks: ArrayLike, frame_ms: float
+) -> Picture:
+    """Draw some frames of a video above those of the truth, with their times."""
+    chosen = np.asarray(picks, np.intp)
+    stamps = [f"{frame * frame_ms:.2f} ms" for frame in chosen.tolist()]
+    return strip(name, caption, (("ours", video[chosen]), ("truth", truth[chosen])), stamps)
 
 
 def strips(

@@ -9,7 +9,7 @@ from scipy.ndimage import map_coordinates
 
 from acquire.evaluate.metrics import psnr, ssim
 from acquire.evaluate.paper.comparison import Row, same, statement
-from acquire.evaluate.paper.drawing import show, strip
+from acquire.evaluate.paper.drawing import compared, show
 from acquire.evaluate.paper.studio import PaperFigure, Picture, true_voxels
 from acquire.evaluate.themed import SOLVER_COLOURS, THEORY, canvas
 
@@ -57,7 +57,7 @@ def figure(studio: Studio) -> PaperFigure:
                 "(a) all positions at once: the truth and our reconstruction.",
                 narrow_in=NARROW_TRAJECTORY_IN,
             ),
-            _frames(
+            compared(
                 "detail",
                 "(b) N_m = 1, T_m = 820: the stripes are clear, the fast fish is blurred along its path.",
                 detail,
@@ -65,7 +65,7 @@ def figure(studio: Studio) -> PaperFigure:
                 picks=range(5),
                 frame_ms=frame_ms[0],
             ),
-            _frames(
+            compared(
                 "motion",
                 "(d) N_m = 3, T_m = 4: the fast fish is sharp, the stripes have lost contrast.",
                 motion,
@@ -144,13 +144,6 @@ def _trajectory(truth: NDArray[Any], video: NDArray[Any]) -> Figure:
     show(axes[0], truth.max(axis=0), title="truth, brightest over time")
     show(axes[1], video.max(axis=0), title="ours, 54 × 54")
     return drawing
-
-
-def _frames(
-    name: str, caption: str, video: NDArray[Any], truth: NDArray[Any], picks: range, frame_ms: float
-) -> Picture:
-    stamps = [f"{frame * frame_ms:.2f} ms" for frame in picks]
-    return strip(name, caption, (("ours", video[picks]), ("truth", truth[picks])), stamps)
 
 
 def _stripes(profiles: dict[str, NDArray[np.float64]]) -> Figure:

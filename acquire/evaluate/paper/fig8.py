@@ -10,7 +10,7 @@ import numpy as np
 from acquire.evaluate.metrics import psnr
 from acquire.evaluate.paper.bars import contrasts, last_resolved, place_of
 from acquire.evaluate.paper.comparison import Row, in_elements, same, statement
-from acquire.evaluate.paper.drawing import box, show, strip
+from acquire.evaluate.paper.drawing import box, compared, show
 from acquire.evaluate.paper.studio import PaperFigure, Picture, read, true_voxels
 from acquire.evaluate.themed import canvas
 
@@ -66,10 +66,10 @@ def figure(studio: Studio) -> PaperFigure:
         "N_m = 3, T_m = 4. #B, which is stationary, is reconstructed in voxels of N_m = 1, T_m = 220 (230, "
         "adjusted so that nine fill it), from the lines that see only #B. One video holds all three.",
         pictures=(
-            _strip(
+            compared(
                 "a", "(a), (b) #A: the window slides up.", video, truth=fine, picks=picks_a, frame_ms=frame_ms
             ),
-            _strip(
+            compared(
                 "b",
                 "(d) #B: the open window, in fine pixels.",
                 video,
@@ -77,7 +77,7 @@ def figure(studio: Studio) -> PaperFigure:
                 picks=picks_b,
                 frame_ms=frame_ms,
             ),
-            _strip(
+            compared(
                 "c",
                 "(e), (f) #C: the window slides to the left.",
                 video,
@@ -124,18 +124,6 @@ def _named(element: str) -> str:
 
 def _kept(facts: dict[str, Any]) -> list[str]:
     return [str(part["end_substep"] - part["begin_substep"]) for part in facts["segments"]]
-
-
-def _strip(
-    name: str,
-    caption: str,
-    video: NDArray[Any],
-    truth: NDArray[Any],
-    picks: NDArray[np.int64],
-    frame_ms: float,
-) -> Picture:
-    stamps = [f"{frame * frame_ms:.2f} ms" for frame in picks]
-    return strip(name, caption, (("ours", video[picks]), ("truth", truth[picks])), stamps)
 
 
 def _close(video: NDArray[Any], truth: NDArray[Any], a: int, b: int, c: int) -> Figure:

@@ -120,6 +120,7 @@ def _lamps(video: NDArray[np.float64], interval_s: float) -> Iterator[Lamp]:
     quarter = 2 * (rows >= mean.shape[0] // 2) + (columns >= mean.shape[1] // 2)
     for number, place in enumerate(QUARTERS):
         inside = quarter == number
+        # Not the maximum, which one voxel of noise would decide.
         bright = float(np.percentile(mean[inside], 98))
         if bright <= FAINT * float(np.percentile(mean, 99)):
             continue

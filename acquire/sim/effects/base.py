@@ -101,6 +101,7 @@ def draws(effect: str, setting: Setting, tile: int, *, arm: str | None = None) -
     """Return the random stream of one effect, arm and tile; it differs between realisations."""
     # Keys must not be negative, and tiles of the preroll are: the sign is a word of its own.
     key = (*_name_key(effect, arm or setting.arm), setting.realisation, 1, tile & 0xFFFFFFFF, tile < 0)
+    # Not `default_rng`, whose generator a later NumPy may replace: the same seed would give other lines.
     return np.random.Generator(np.random.PCG64(np.random.SeedSequence(setting.seed, spawn_key=key)))
 
 

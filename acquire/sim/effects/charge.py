@@ -24,6 +24,7 @@ class Prnu(Effect):
 
     def stages(self, setting: Setting) -> list[Stage]:
         """μ_e ← μ_e·max(0, 1 + N(0, PRNU₁₂₈₈)), fixed per pixel of the line: TDI averages over the stages."""
+        # A wide distribution reaches below 0, but no pixel has less charge the more light it gets.
         gain = np.maximum(1 + self.prnu * pattern("prnu", setting).standard_normal(setting.pixels), 0)
 
         def run(electrons: NDArray[Any], first_line: int) -> NDArray[Any]:  # noqa: ARG001
@@ -44,6 +45,7 @@ class ShotNoise(Effect):
 
         def run(electrons: NDArray[Any], first_line: int) -> NDArray[Any]:
             stream = draws("shot_noise", setting, first_line // TILE_LINES)
+            # numpy refuses a mean below 0.
             counted: NDArray[Any] = stream.poisson(np.maximum(electrons, 0)).astype(np.float64)
             return counted
 

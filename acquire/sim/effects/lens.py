@@ -75,6 +75,7 @@ class Vignetting(Effect):
         half, centre = setting.scene.size / 2, (setting.scene.size - 1) / 2
         rows, columns = np.indices((setting.scene.size,) * 2, np.float64) - centre
         distance = ((rows - self.rows) ** 2 + (columns - self.columns) ** 2) / (2 * half**2)
+        # Far from an axis outside the field the parabola is below 0.
         transmission = np.maximum(1 - self.loss * distance, 0).astype(np.float32)
 
         def run(frames: NDArray[np.float32]) -> NDArray[np.float32]:

@@ -111,6 +111,7 @@ class LedNonlinearity(Effect):
     def stages(self, setting: Setting) -> list[Stage]:  # noqa: ARG002
         """d → a·(1 − exp(−d/a)): slope 1 for small drives, never more than a (near saturation: Fig. 9c)."""
         a = self.saturation
+        # expm1, since 1 − exp(−x) loses its digits for small drives.
         return [_shaped("led_nonlinearity", lambda light: lambda *at: -a * np.expm1(-light.light(*at) / a))]
 
 
@@ -219,6 +220,7 @@ def jitter(effect: TriggerJitter, setting: Setting) -> Tiled:
 
     def compute(first: int, count: int) -> NDArray[Any]:
         drawn = draws("trigger_jitter", setting, first // _TILE).standard_normal(count)
+        # Clipped, so that transfers stay in their order, and a row's light comes from its neighbours at most.
         return np.clip(sigma * drawn, -0.5, 0.5)
 
     return Tiled(compute, _TILE)

@@ -79,6 +79,7 @@ class AdcNonlinearity(Effect):
 
         def run(dn: NDArray[Any], first_line: int) -> NDArray[Any]:  # noqa: ARG001
             part = np.clip((dn - black) / white, 0, 1)
+            # 4·x·(1 − x) is 0 at both ends and 1 in the middle.
             bent: NDArray[Any] = dn + 4 * self.bow * white * part * (1 - part)
             return bent
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal
 import numpy as np
 from pydantic import Field
 
-from acquire.sim.effects.base import Effect, Place, Setting, Stage
+from acquire.sim.effects.base import TILE_LINES, Effect, Place, Setting, Stage
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -68,8 +68,10 @@ def tail(inefficiency: float, transfers: int) -> NDArray[np.float64]:
     count = np.arange(1, transfers + 1, dtype=np.float64)
     term = (1 - inefficiency) ** count
     weights = [term.mean()]
-    while 1 - sum(weights) > _TAIL and len(weights) < 256:
+    # Fewer than a tile of lines, which is the history that an image keeps (`pipeline`).
+    while 1 - sum(weights) > _TAIL and len(weights) < TILE_LINES:
         k = len(weights)
+        # C(N + k − 1, k) is C(N + k − 2, k − 1)·(N + k − 1)/k.
         term = term * (count + k - 1) / k * inefficiency
         weights.append(term.mean())
     return np.array(weights)

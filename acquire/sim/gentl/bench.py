@@ -69,6 +69,7 @@ class GentlBench:
                 memory = self.cameras[model.serial] = CameraMemory(model)
                 (self._directory / f"{model.serial}{layout.SUFFIX}").symlink_to(memory.path)
                 self._feeders.append(Worker(f"sensor {model.serial}", life, memory, opener))
+            # All are started before the first is awaited: each takes its time to import what it needs.
             deadline = time.monotonic() + _START_S
             for feeder in self._feeders:
                 feeder.expect(Ready, deadline)

@@ -22,6 +22,7 @@ OPTIONS = (
     "-O2",
     "-shared",
     "-fPIC",
+    # A host sees the functions of the standard, which the source exports, and no others.
     "-fvisibility=hidden",
     "-Wall",
     "-Wextra",

@@ -79,6 +79,7 @@ class Module:
     def space(self, base: int = 0) -> bytes:
         """Return the module's whole register space, at address ``base``: values, URL and XML."""
         text = self.xml(base).encode()
+        # As GenTL has it: file name, address and length, both in hex without 0x.
         url = f"local:{self.name}.xml;{XML_AT:X};{len(text):X}".encode()
         if XML_AT + len(text) > PORT_BYTES:
             raise ValueError(

@@ -41,8 +41,23 @@ class CameraModel:
 
 def remote(model: CameraModel) -> Module:
     """The camera itself."""
+    analog, counters = "AnalogControl", "CounterAndTimerControl"
     return Module(
-        "Remote", (*_identity(model), *_image(model), *_acquisition(model), *_analog(), *_counters())
+        "Remote",
+        (
+            *_identity(model),
+            *_image(model),
+            *_acquisition(model),
+            enum("AnalogGain", [f"Gain{n}" for n in ("1x", "2x", "4x")], analog),
+            Feature("DigitalGain", "float", 1.0, 1.0, 32.0, category=analog),
+            enum("BinningHorizontal", ["X1"], analog),
+            enum("BinningVertical", ["X1"], analog),
+            enum("CounterSelector", ["Counter0"], counters),
+            enum("CounterEventSource", ["LineTriggerMissed"], counters),
+            Feature(
+                "CounterValue", maximum=2**62, writable=False, category=counters, at=REGISTERS["CounterValue"]
+            ),
+        ),
     )
 
 
@@ -112,27 +127,6 @@ def _acquisition(model: CameraModel) -> tuple[Feature, ...]:
         enum("TriggerSource", ["CXPin", "LineIn0"], category, selector="TriggerSelector"),
         enum("TriggerActivation", ["RisingEdge", "FallingEdge"], category, selector="TriggerSelector"),
     )  # fmt: skip
-
-
-def _analog() -> tuple[Feature, ...]:
-    category = "AnalogControl"
-    return (
-        enum("AnalogGain", [f"Gain{n}" for n in ("1x", "2x", "4x")], category),
-        Feature("DigitalGain", "float", 1.0, 1.0, 32.0, category=category),
-        enum("BinningHorizontal", ["X1"], category),
-        enum("BinningVertical", ["X1"], category),
-    )
-
-
-def _counters() -> tuple[Feature, ...]:
-    category = "CounterAndTimerControl"
-    return (
-        enum("CounterSelector", ["Counter0"], category),
-        enum("CounterEventSource", ["LineTriggerMissed"], category),
-        Feature(
-            "CounterValue", maximum=2**62, writable=False, category=category, at=REGISTERS["CounterValue"]
-        ),
-    )
 
 
 def gige(model: CameraModel) -> Module:

@@ -54,6 +54,7 @@ class GigeArms:
 
 def address_of(arm: str) -> str:
     """Return a loopback address that no other process of this host uses for its cameras."""
+    # Not 127.0, which holds localhost, nor 127.255, which holds the broadcast address.
     # after 65 024 process ids the addresses repeat; one that is taken is refused
     pid = os.getpid() % (1 << 16)
     return f"127.{1 + pid // 256 % 254}.{pid % 256}.{1 + ARMS.index(arm)}"

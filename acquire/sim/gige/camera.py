@@ -54,6 +54,7 @@ class Transmission:
 
     def frame_id(self, frame: int) -> int:
         """Return the id of a frame; frames count from 0."""
+        # 0 is not an image's: the standard reserves it for the packet that tests the path.
         return 1 + (self.first_id - 1 + frame) % (2**64 - 1 if self.extended else 0xFFFF)
 
 
@@ -119,16 +120,17 @@ class GigeCamera:
                 self._waiting = [(numbers[height:], lines[height:])] if len(lines) > height else []
 
     def _answer(self, control: socket.socket) -> None:
+        # The standard limits a control packet to 576 bytes.
         packet, sender = control.recvfrom(2048)
         request = protocol.parse(packet)
         if request is None:
             return
         if request.command == protocol.Command.RESEND:
             # A request for a frame that is no longer kept gets no answer: the host gives the frame up.
-            number, first, last = protocol.parse_resend(request)
+            asked = protocol.parse_resend(request)
             for kept, packets in self._sent if self.transmission.resends else ():
-                if kept == number:
-                    self._put(packets[first : last + 1])
+                if asked is not None and kept == asked[0]:
+                    self._put(packets[asked[1] : asked[2] + 1])
             return
         # The same request again means that its answer did not arrive in time: only the answer is repeated.
         if (sender, request) != self._answered[:2]:
@@ -165,6 +167,7 @@ class GigeCamera:
                 self._set_register(name, 0)
                 self._acquiring = wanted
                 self._waiting.clear()
+                # Frames are numbered anew: packets of an earlier acquisition would be sent in their place.
                 self._sent.clear()
                 self._frames = 0
                 if wanted:

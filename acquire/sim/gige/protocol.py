@@ -22,6 +22,8 @@ KEY = 0x42
 IP_AND_UDP_BYTES = 20 + 8
 """Bytes of IP and UDP headers, which count towards the packet size that the host sets, as GVSP's own do."""
 
+LEAST_PAYLOAD_BYTES = 64
+
 DEVICE_MODE, MAC, ADDRESS = 0x0004, 0x0008, 0x0024
 VENDOR, MODEL, FIRMWARE, SERIAL, XML_URL = 0x0048, 0x0068, 0x0088, 0x00D8, 0x0200
 DISCOVERY_BYTES = 0xF8
@@ -75,16 +77,20 @@ def parse(packet: bytes) -> Request | None:
     if len(packet) < _HEADER.size:
         return None
     key, flags, command, length, number = _HEADER.unpack_from(packet)
+    # One that was cut off on its way gets no answer, and is sent again.
     body = packet[_HEADER.size : _HEADER.size + length]
     return Request(command, number, body, flags) if key == KEY and len(body) == length else None
 
 
-def parse_resend(request: Request) -> tuple[int, int, int]:
-    """Return the number of the frame, and the first and last packet to send again."""
-    if request.flags & _EXTENDED_REQUEST:
-        first, last, number = struct.unpack(">4xIIQ", request.body[:20])
-    else:
-        number, first, last = struct.unpack(">III", request.body[:12])
+def parse_resend(request: Request) -> tuple[int, int, int] | None:
+    """Return the number of the frame, and the first and last packet to send again; None if it is cut off."""
+    try:
+        if request.flags & _EXTENDED_REQUEST:
+            first, last, number = struct.unpack(">4xIIQ", request.body[:20])
+        else:
+            number, first, last = struct.unpack(">III", request.body[:12])
+    except struct.error:
+        return None
     # packet ids have 24 bits
     return number, first & 0xFF_FFFF, last & 0xFF_FFFF
 
@@ -103,8 +109,10 @@ class Registers:
             self.memory[at : at + len(text)] = text.encode()
         # in network byte order, like the standard's numbers
         self.memory[ADDRESS : ADDRESS + 4] = address
+        # A host has to be heard every 3 s unless it sets another time: the standard's own default.
         # Version 1.0 of the standard, big-endian, one stream; time stamps of 10⁹ ticks per second are in ns.
         numbers = {0: 0x1_0000, DEVICE_MODE: 0x8000_0000, STREAM_CHANNELS: 1, HEARTBEAT_MS: 3000}
+        # Packets of 1400 bytes fit into the 1500 of an Ethernet frame, should a host not ask for others.
         numbers |= {CAPABILITY: _RESENDS, TICK_LOW: 1_000_000_000, PACKET_SIZE: 1400}
         for at, value in numbers.items():
             self.set(at, value)
@@ -119,32 +127,32 @@ class Registers:
     def handle(self, request: Request) -> bytes | None:
         """Carry out a command and return its answer; None if it is not supported."""
         try:
-            return self._carry_out(request)
+            match request.command:
+                case Command.DISCOVERY:
+                    body = bytes(self.memory[:DISCOVERY_BYTES])
+                case Command.READ_REGISTER:
+                    (at,) = struct.unpack(">I", request.body[:4])
+                    body = bytes(self.memory[self._place(at, 4)])
+                case Command.WRITE_REGISTER:
+                    at, value = struct.unpack(">II", request.body[:8])
+                    self.memory[self._place(at, 4)] = struct.pack(">I", value)
+                    # By the standard, the number of registers that were written.
+                    body = struct.pack(">I", 1)
+                case Command.READ_MEMORY:
+                    at, count = struct.unpack(">IxxH", request.body[:8])
+                    body = request.body[:4] + bytes(self.memory[self._place(at, count)])
+                case Command.WRITE_MEMORY:
+                    (at,) = struct.unpack(">I", request.body[:4])
+                    data = request.body[4:]
+                    self.memory[self._place(at, len(data))] = data
+                    body = struct.pack(">I", len(data))
+                case _:
+                    return None
         except IndexError:
             return answer(request, b"", Status.INVALID_ADDRESS)
         except struct.error:  # a body that is too short for its command
             return answer(request, b"", Status.INVALID_PARAMETER)
-
-    def _carry_out(self, request: Request) -> bytes | None:
-        match request.command:
-            case Command.DISCOVERY:
-                return answer(request, bytes(self.memory[:DISCOVERY_BYTES]))
-            case Command.READ_REGISTER:
-                (at,) = struct.unpack(">I", request.body[:4])
-                return answer(request, bytes(self.memory[self._place(at, 4)]))
-            case Command.WRITE_REGISTER:
-                at, value = struct.unpack(">II", request.body[:8])
-                self.memory[self._place(at, 4)] = struct.pack(">I", value)
-                return answer(request, struct.pack(">I", 1))
-            case Command.READ_MEMORY:
-                at, count = struct.unpack(">IxxH", request.body[:8])
-                return answer(request, request.body[:4] + bytes(self.memory[self._place(at, count)]))
-            case Command.WRITE_MEMORY:
-                (at,) = struct.unpack(">I", request.body[:4])
-                data = request.body[4:]
-                self.memory[self._place(at, len(data))] = data
-                return answer(request, struct.pack(">I", len(data)))
-        return None
+        return answer(request, body)
 
     def _place(self, at: int, count: int) -> slice:
         """Return the place of ``count`` bytes. Raises IndexError if the camera has none there."""
@@ -170,7 +178,8 @@ class Frame:
 def packets(frame: Frame, packet_size: int) -> Iterator[bytes]:
     """Yield leader, payload and trailer."""
     size = (_GVSP_EXTENDED if frame.extended else _GVSP).size
-    step = packet_size - IP_AND_UDP_BYTES - size
+    # A host may write any size, also one of packets that hold nothing.
+    step = max(LEAST_PAYLOAD_BYTES, packet_size - IP_AND_UDP_BYTES - size)
     leader = (0, _IMAGE, frame.time_ns, frame.pixel_format, frame.width, frame.height, frame.offset, 0, 0, 0)
     # formats of packets: 1 is a leader, 3 payload, 2 a trailer
     yield _header(frame, 1, 0) + _LEADER.pack(*leader)
