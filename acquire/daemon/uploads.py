@@ -114,7 +114,8 @@ class Uploads:
 
     def add(self, path: Path) -> None:
         """Copy a recording of a run, unless it is known already."""
-        if path not in self._ours:
+        # Without a place, nothing would ever be over, and so nothing forgotten.
+        if self._target is not None and path not in self._ours:
             self._ours.add(path)
             self.renew(path)
 
