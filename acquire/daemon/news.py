@@ -68,7 +68,7 @@ class NewsLog:
         """Return the news after ``last_id``, or all; preceded by a 'missed' if some are not kept any more."""
         with self._lock:
             life, _, number = (last_id or "").partition("-")
-            ours = life == self.life and number.isdecimal()
+            ours = life == self.life and number.isdecimal()  # it comes from a client, and may be anything
             seen = int(number) if ours else 0
             first = self._count - len(self._kept) + 1
             news = [one for k, one in enumerate(self._kept, first) if k > seen]
