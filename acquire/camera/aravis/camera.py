@@ -188,6 +188,8 @@ class AravisCamera:
         self._heard_s = time.monotonic()
         assert self._stream is not None
         assert self._assembly is not None
+        # Now, and not one by one: `disarm` has to free them also if the next lines find the camera gone.
+        self._taken.update(buffers)
         try:
             missed = self._missed.count()
         except CameraError as error:
@@ -199,9 +201,9 @@ class AravisCamera:
         for buffer in buffers:
             # The stream was ended before this buffer was filled: it stands for no frame.
             if self._library.arv_buffer_get_status(buffer) == _ABORTED:
+                self._taken.remove(buffer)
                 self._give(self._stream, buffer)
                 continue
-            self._taken.add(buffer)
             blocks, free = self._assembly.take(self._frame(buffer, underruns, missed))
             self._ready += blocks
             for idle in free:
