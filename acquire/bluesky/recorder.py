@@ -168,7 +168,7 @@ class Recorder(Device, Stageable, Preparable, Flyable, Collectable, WritesStream
                 await self._stop()
             await asyncio.sleep(POLL_S)
         if self._staged:  # otherwise `unstage` stopped it, on behalf of the plan
-            self._check_outcome(account, status)
+            await asyncio.to_thread(self._check_outcome, account, status)
 
     @AsyncStatus.wrap
     async def unstage(self) -> None:
