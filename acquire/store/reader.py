@@ -220,6 +220,7 @@ class Recording(Outline):
 
     def _rows(self, first_line: int, lines: int) -> tuple[int, int]:
         start = first_line - self.first_line
+        # First: dropped lines count among the recording's, and the second check would let them pass.
         for first, count in self.dropped:
             if lines > 0 and first < first_line + lines and first_line < first + count:
                 raise DataError(

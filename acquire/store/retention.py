@@ -207,20 +207,18 @@ class Keeper:
         """
         # Read the holds again: shards may have been held since they were chosen.
         held = [hold.lines for hold in self._marks()]
-        saved = [shard for shard in shards if self._held(shard, held) or not self._delete(shard)]
-        for shard in saved:
+        saved = []
+        for shard in shards:
+            if not self._held(shard, held):
+                try:
+                    remove(self.disk, self.path, Dropped(shard, self.gone))
+                    continue
+                except DataError:  # its files are links by now, and stay
+                    self.odd.add(shard)
+            saved.append(shard)
             self.gone = _without(self.gone, shard)
             self.sizes[shard] = shard_bytes(self.path, shard)
         return saved
-
-    def _delete(self, shard: int) -> bool:
-        """Delete a shard; return False if its files are links by now, which stay."""
-        try:
-            remove(self.disk, self.path, Dropped(shard, self.gone))
-        except DataError:
-            self.odd.add(shard)
-            return False
-        return True
 
     def attributes(self) -> dict[str, Any]:
         """Return the attributes ``dropped`` and ``holds`` for the recording's root."""

@@ -129,7 +129,7 @@ class RecordingWriter:
         try:
             writer = cls(path, spec, disk)
             writer._create_parts()
-        except (AcquireError, MemoryError):
+        except (AcquireError, MemoryError):  # the buffers of the chunks are allocated here
             if writer is not None:
                 writer.close()
             remove(disk, path, Unborn(0))
