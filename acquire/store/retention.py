@@ -78,7 +78,7 @@ def hold(path: Path, first_line: int, count: int, why: str = "", disk: Disk = DI
     text = json.dumps({"first_line": first_line, "count": count, "why": why}).encode()
     try:
         disk.make_directory(directory, parents=True)
-        name = f"{first_line}-{count}.json"
+        name = f"{first_line}-{count}.json"  # the same lines, held again, replace their file
         Publisher(directory / f".{name}", disk).replace(directory / name, text, durable=True)
     except OSError as error:
         raise refusal(f"{path}: lines {first_line} to {first_line + count - 1}", error, "held") from error
@@ -103,6 +103,7 @@ def keep_from(path: Path, line: int, url: str, disk: Disk = DISK) -> None:
     refuse_link(path, _holds(path))
     try:
         disk.make_directory(_holds(path), parents=True)
+        # A scratch file of its own, beside that of `hold`: the two are different processes.
         Publisher(_holds(path) / ".copy", disk).replace(_copy_hold(path, url), text, durable=True)
     except OSError as error:
         raise refusal(f"{path}: lines from {line} on", error, "held") from error

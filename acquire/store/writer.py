@@ -141,6 +141,7 @@ class RecordingWriter:
 
         Raises StoreError if the disk refuses; then nothing is left behind.
         """
+        # Chosen only now, since the lines go on while the parts are created.
         self.spec = replace(self.spec, first_line=first_line)
         for arm in self._arms.values():
             arm.begin(first_line)
