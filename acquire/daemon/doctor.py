@@ -285,15 +285,15 @@ def _port(rig: RigConfig | None) -> Iterator[Finding]:
     if rig is None or rig.web is None or rig.web.port == 0:
         return
     family = socket.AF_INET6 if ":" in rig.web.host else socket.AF_INET
-    with socket.socket(family) as probe:
-        # As the page does, so that connections that have just been closed do not count.
-        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        try:
+    try:
+        with socket.socket(family) as probe:  # refused itself where the kernel has no IPv6
+            # As the page does, so that connections that have just been closed do not count.
+            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
             probe.bind((rig.web.host, rig.web.port))
-        except OSError as error:
-            text = f"{rig.web.host}:{rig.web.port}: {error.strerror}"
-            yield Finding("page", "warning", text, "another web.port, unless it is the page that is running")
-            return
+    except OSError as error:
+        text = f"{rig.web.host}:{rig.web.port}: {error.strerror}"
+        yield Finding("page", "warning", text, "another web.port, unless it is the page that is running")
+        return
     yield Finding("page", "good", f"{rig.web.host}:{rig.web.port} is free")
 
 
