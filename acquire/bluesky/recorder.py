@@ -111,7 +111,7 @@ class Recorder(Device, Stageable, Preparable, Flyable, Collectable, WritesStream
                 )
             if status.state is State.IDLE:
                 await self._client.arm()
-                self._armed = True
+                self._armed = True  # an instrument that somebody else armed stays armed in the end
             self._staged, self._request, self._account = True, StartRequest(), None
 
     @AsyncStatus.wrap
@@ -142,6 +142,7 @@ class Recorder(Device, Stageable, Preparable, Flyable, Collectable, WritesStream
                 raise DeviceError(f"{self.name}: the daemon did not report the recording that it started")
             budget = status.recording.budget_lines if status.recording else self._request.lines
             self._account = Account(self.name, rig, recording.path, budget)
+            # In a thread, as all looks at files: a network disk may hang, and the RunEngine's loop must not.
             if not await asyncio.to_thread(recording.path.exists):
                 await self._stop()
                 raise UsageError(
@@ -167,7 +168,7 @@ class Recorder(Device, Stageable, Preparable, Flyable, Collectable, WritesStream
                 await self._stop()
             await asyncio.sleep(POLL_S)
         if self._staged:  # otherwise `unstage` stopped it, on behalf of the plan
-            self._check_outcome(account, status)
+            await asyncio.to_thread(self._check_outcome, account, status)
 
     @AsyncStatus.wrap
     async def unstage(self) -> None:

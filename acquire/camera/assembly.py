@@ -28,6 +28,7 @@ STATISTICS = ("lines", "lost", "incomplete_frames", "stale_frames")
 """Lines delivered and lost; frames that arrived incomplete; frames that were late or sent twice."""
 _WAITING_SHARE = 4
 """One in this many of a camera's buffers may hold frames whose place is not known yet."""
+# Frames of thousands of lines would otherwise get one or two, and those of a fast camera take all memory.
 _LEAST_BUFFERS = 16
 _MOST_BUFFER_BYTES = 1 << 30
 
@@ -165,6 +166,7 @@ class Assembly:
         if place is None:
             self._statistics["stale_frames"] += 1
             return [], [frame.buffer]
+        # Only now: the size of a frame shows how its lines are packed, see `for_frames`.
         if self._reader is None:
             found = self._format
             self._reader = LineReader.for_frames(
@@ -187,6 +189,7 @@ class Assembly:
         """Let the frame wait for a number; return the buffers that have to be given up for that."""
         self._unnumbered += 1
         self._waiting.append(frame)
+        # Those that wait keep their buffers: if all did, no frame could come that would end their wait.
         if len(self._waiting) <= self._most_waiting:
             return []
         free, self._waiting = [waited.buffer for waited in self._waiting], []

@@ -200,6 +200,7 @@ class FrameCount:
         if self._skips_zero is None:
             self._skips_zero = self._first_id == 1
             if frame.time_ns is not None and self._last.time_ns is not None and self._period_ns:
+                # The time since the last frame shows which one this is: one fewer if 0 was skipped.
                 frames = (frame.time_ns - self._last.time_ns) / (self._period_ns * self._height)
                 if min(abs(frames - ahead), abs(frames - (ahead - 1))) < _CERTAIN:
                     self._skips_zero = frames < ahead - _CERTAIN
@@ -226,6 +227,7 @@ class FrameCount:
         return missed
 
     def _explain(self, frame: FrameFacts, lost: int, missed: int, incomplete: int) -> Iterator[CameraLoss]:
+        # First what somebody has counted; only the rest of the hole is put down to the link.
         if missed:
             yield CameraLoss(LossCause.MISSED_TRIGGER, missed)
         if incomplete:

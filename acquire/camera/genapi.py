@@ -61,6 +61,7 @@ class GenapiFeatures:
 
         for feature in category.features:
             if feature.node.principal_interface_type == genapi.EInterfaceType.intfICategory:
+                # A category may be listed in several, and a description may even name one within itself.
                 if feature.node.name not in found:
                     self._collect(feature, feature.node.name, found)
             elif feature.node.name not in found.setdefault(name, []):

@@ -226,7 +226,7 @@ class HarvestersCamera:
         """Stop, in any state of the camera."""
         if not self._armed:
             return
-        self._armed = False
+        self._armed = False  # first: `release` must not queue a buffer of a stream that is being stopped
         self._held.clear()
         self._ready.clear()
         self._views.clear()  # before their memory is freed

@@ -62,6 +62,7 @@ class LiveCamera:
             raise message.error
         if isinstance(message, Readings):
             return message.of
+        # Last: a process that has died may have sent readings, or its error, before.
         if self._worker.death is not None:
             raise CameraError(f"{self._worker.name}: its process is gone: {self._worker.death}")
         return {}

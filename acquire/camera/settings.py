@@ -179,7 +179,7 @@ def _number(value: float) -> str:
 
 
 def _compare(setting: Setting, node: Node, when: str) -> None:
-    if not node.readable:
+    if not node.readable:  # some features can only be written: nothing shows what became of the value
         return
     found, wanted = node.read(), coerce_loosely(setting, node)
     if node.kind == "float":
@@ -200,7 +200,7 @@ def coerce_loosely(setting: Setting, node: Node) -> Value:
 def _integer(value: Value) -> int | None:
     if isinstance(value, str):
         try:
-            return int(value, 0)
+            return int(value, 0)  # 0: also "0x1f", as manuals give the values of registers
         except ValueError:
             return None
     # The remainder of an infinite value is NaN, which counts as true.
@@ -225,10 +225,6 @@ def _text(value: Value) -> str | None:
     return value if isinstance(value, str) else None
 
 
-def _none(value: Any) -> None:  # noqa: ARG001 - the signature of its siblings
-    return None
-
-
 _COERCE: dict[str, Any] = {
     "integer": _integer,
     "float": _real,
@@ -236,5 +232,5 @@ _COERCE: dict[str, Any] = {
     "boolean": _boolean,
     "text": _text,
     "command": _boolean,
-    "other": _none,
+    "other": lambda _: None,
 }

@@ -50,7 +50,7 @@ def spec_of(config: RigConfig, arm: str, cti: str | None = None) -> GenicamSpec:
         bits=camera.bits,
         line_rate_hz=config.line_rate_hz,
         buffer_s=camera.buffer_s,
-        cti=camera.cti if cti is None else cti,
+        cti=camera.cti if cti is None else cti,  # "" is a choice as well: any producer
         frame_id_bits=camera.frame_id_bits,
         frame_id_first=camera.frame_id_first,
     )

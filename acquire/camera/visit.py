@@ -48,6 +48,7 @@ def visit(
     deadline = time.monotonic() + timeout_s
     try:
         if armed is not None:
+            # `armed` may start the trigger, whose lines must not come before the camera waits for them.
             worker.expect(Armed, deadline)
             armed()
         seen: T = worker.expect(Seen, deadline).result

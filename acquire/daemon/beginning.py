@@ -37,6 +37,7 @@ async def begin(
         try:
             if status.state is State.IDLE:
                 await run(lambda: service.arm(ArmRequest()))
+                # By its number: a user may disarm and arm again while this waits for its next try.
                 ours = service.status().run_id
             if config.begin == "recording":
                 await run(lambda: service.start(StartRequest()))

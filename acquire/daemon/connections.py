@@ -36,6 +36,8 @@ if TYPE_CHECKING:
 # More than streams (`stream.MOST_STREAMS`) and commands (`server.MOST_WAITING`) can occupy together, which
 # leaves some for the status.
 MOST_CONNECTIONS = 32
+# asyncio takes the `backlog` that it is given for this number as well: with uvicorn's 2048, a flood would be
+# accepted in one turn, and the requests of others would wait for all of it.
 AT_ONCE = 16
 """Connections accepted in one turn of the event loop."""
 WAITING = 1024

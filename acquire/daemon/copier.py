@@ -100,13 +100,14 @@ class Job:
 
 def wait_s(tries: int) -> float:
     """Return the wait before the next try, after ``tries + 1`` consecutive failures."""
+    # Limited before it is doubled: after a day without the store, the number would be too large for a float.
     return min(math.ldexp(FIRST_WAIT_S, min(tries, 16)), MOST_WAIT_S)
 
 
 def copy_recordings(mailbox: Mailbox, target: str, copies: tuple[Copy, ...]) -> None:
     """Main function of the process, until its owner ends it; it begins with ``copies``."""
     stand_back(_NICE, EARLY)
-    be_patient()
+    be_patient()  # before a store is opened, which reads the environment only then
     with contextlib.suppress(UsageError):  # each try reports it
         check_url(target)  # imports packages, which takes a moment
     mailbox.post(Reached(0))  # answers no query, but shows the owner that this process can
@@ -132,7 +133,19 @@ class Copier:
         due = [job for job in self._jobs.values() if job.not_before_s <= now_s]
         if due:
             # The growing recording comes first, since its retention waits for the copy.
-            self._serve(min(due, key=lambda job: not (job.ours and job.grows)))
+            job = min(due, key=lambda job: not (job.ours and job.grows))
+            try:
+                if job.mirror is not None or self._begin(job):
+                    assert job.mirror is not None
+                    self._advance(job, job.mirror)
+            except PlaceError as error:  # the bucket, permissions or credentials may still be created
+                self._put_off(job, error.message, error.hint)
+            except UsageError as error:
+                self._end(job, state="refused", error=error.message, hint=error.hint)
+            except AcquireError as error:
+                self._put_off(job, error.message, error.hint)
+            except OSError as error:
+                self._put_off(job, f"{job.path}: {error.strerror or error}")
             return
         until_s = min([now_s + IDLE_S, *(job.not_before_s for job in self._jobs.values())])
         waiting = select.poll()
@@ -164,20 +177,6 @@ class Copier:
             found = refusal(self._target, error, "written")
             return Reached(number, ErrorMessage.of(found), refused=isinstance(found, PlaceError))
         return Reached(number)
-
-    def _serve(self, job: Job) -> None:
-        try:
-            if job.mirror is not None or self._begin(job):
-                assert job.mirror is not None
-                self._advance(job, job.mirror)
-        except PlaceError as error:  # the bucket, permissions or credentials may still be created
-            self._put_off(job, error.message, error.hint)
-        except UsageError as error:
-            self._end(job, state="refused", error=error.message, hint=error.hint)
-        except AcquireError as error:
-            self._put_off(job, error.message, error.hint)
-        except OSError as error:
-            self._put_off(job, f"{job.path}: {error.strerror or error}")
 
     def _begin(self, job: Job) -> bool:
         """Open the copy; return False if it has to wait, or will never come. Raises as `Mirror` does."""
@@ -226,6 +225,7 @@ class Copier:
         job.reset()
         job.not_before_s = time.monotonic() + wait_s(job.tries)
         job.tries += 1
+        # Counted here, since no `Mirror` does while there is none: a recording grows while its store is away.
         here: int | None = None
         with contextlib.suppress(AcquireError):
             here = open_recording(job.path).lines

@@ -75,6 +75,7 @@ class DiskWatch:
             with self._changing:
                 while len(self._looks) > 1:  # other programs' writes do not predict the next recording
                     self._looks.popleft()
+        # One query at a time: each that hangs would leave another thread behind.
         if self._thread is not None and self._thread.is_alive():
             return
         if self._now_s() - self._asked_s < LOOK_EVERY_S:

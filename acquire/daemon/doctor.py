@@ -33,6 +33,7 @@ if TYPE_CHECKING:
 
 Level = Literal["good", "warning", "bad"]
 LEAST_DESCRIPTORS = 4096
+# The kernel's default of 16 is less than the buffers of one camera; their makers recommend this number.
 USB_BUFFER_MB = 1000
 DISK_GB = 50.0
 """Less than this is soon full."""
@@ -143,7 +144,7 @@ def _governor() -> Finding:
 
 def _realtime(rig: RigConfig | None) -> Finding:
     soft, _ = resource.getrlimit(resource.RLIMIT_RTPRIO)
-    allowed = soft != 0 or os.geteuid() == 0
+    allowed = soft != 0 or os.geteuid() == 0  # root has CAP_SYS_NICE, for which there is no limit
     wanted = rig is not None and rig.stream.realtime
     if allowed:
         return Finding("real time", "good", "this user may run grabbers in real time")
@@ -250,7 +251,7 @@ def _usb(rig: RigConfig | None) -> Iterator[Finding]:
     if not _uses(rig, "aravis", "harvesters") or not path.exists():
         return
     most = int(_read(path) or 0)
-    if most == 0 or most >= USB_BUFFER_MB:
+    if most == 0 or most >= USB_BUFFER_MB:  # to the kernel, 0 is no limit
         yield Finding("usb", "good", f"usbfs may use {'any memory' if most == 0 else f'{most} MB'}")
     else:
         todo = f"echo {USB_BUFFER_MB} > {path}, or usbcore.usbfs_memory_mb={USB_BUFFER_MB} at boot"
@@ -284,15 +285,15 @@ def _port(rig: RigConfig | None) -> Iterator[Finding]:
     if rig is None or rig.web is None or rig.web.port == 0:
         return
     family = socket.AF_INET6 if ":" in rig.web.host else socket.AF_INET
-    with socket.socket(family) as probe:
-        # As the page does, so that connections that have just been closed do not count.
-        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        try:
+    try:
+        with socket.socket(family) as probe:  # refused itself where the kernel has no IPv6
+            # As the page does, so that connections that have just been closed do not count.
+            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
             probe.bind((rig.web.host, rig.web.port))
-        except OSError as error:
-            text = f"{rig.web.host}:{rig.web.port}: {error.strerror}"
-            yield Finding("page", "warning", text, "another web.port, unless it is the page that is running")
-            return
+    except OSError as error:
+        text = f"{rig.web.host}:{rig.web.port}: {error.strerror}"
+        yield Finding("page", "warning", text, "another web.port, unless it is the page that is running")
+        return
     yield Finding("page", "good", f"{rig.web.host}:{rig.web.port} is free")
 
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import logging
 import os
+import signal
 import sys
 import threading
 import time
@@ -51,6 +52,7 @@ class LastResort:
             self._timer = None
 
     def _end(self, seconds: float) -> None:
+        _not_for_ever()
         # Logged first: once the process has ended, nothing shows which thread hung.
         log.error("not ended after %g s, ending by force: %s", seconds, "; ".join(busy_threads()))
         self._clean_up()
@@ -64,6 +66,7 @@ def leave(code: int) -> int:
     for thread in _others():
         thread.join(max(0.0, deadline - time.monotonic()))
     if _others():
+        _not_for_ever()
         log.warning("ended without waiting for %s", "; ".join(busy_threads()))
         # `os._exit` flushes nothing.
         logging.shutdown()
@@ -82,6 +85,13 @@ def busy_threads() -> list[str]:
             at = traceback.extract_stack(frame)[-1]
             found.append(f"thread {thread.name} at {at.filename}:{at.lineno} ({at.name})")
     return found
+
+
+def _not_for_ever() -> None:
+    """Have the kernel end the process (SIGALRM) if it is still there after `LINGER_S`."""
+    # The log may take no text, since its terminal was stopped or its pager is not read: the thread that waits
+    # for that holds the log's lock, so that the last lines, too, would be waited for without limit.
+    signal.setitimer(signal.ITIMER_REAL, LINGER_S)
 
 
 def _others() -> list[threading.Thread]:

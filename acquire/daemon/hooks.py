@@ -19,7 +19,6 @@ from acquire.daemon.states import State
 
 if TYPE_CHECKING:
     from acquire.config.service import HooksConfig
-    from acquire.daemon.facts import News
     from acquire.daemon.news import NewsLog
 
 END_S = 2.0
@@ -53,6 +52,7 @@ class Hooks:
 
     def close(self) -> None:
         """Send the remaining news, for `END_S` at most. Idempotent."""
+        # In this order: if it were woken first, it could look for its end too early, and wait for ever.
         self._ended = True
         self._happened.set()
         self._news.forget(self._happened.set)
@@ -66,7 +66,14 @@ class Hooks:
             self._happened.clear()
             found = self._news.after(self._last_id)
             self._last_id = found[-1].id if found else self._last_id
-            for news in [one for one in found if self._concerns(one)][-MOST_AT_ONCE:]:
+            wanted = []
+            for news in found:
+                # A change of state with the level of an error is how the log tells a fault.
+                fault = news.kind == "state" and news.state is State.FAULTED and news.level == "error"
+                if ("fault" if fault else news.kind) in self._config.on:
+                    wanted.append(news)
+            # A hook may take its whole timeout, and a burst has hundreds of news: it would be late by hours.
+            for news in wanted[-MOST_AT_ONCE:]:
                 # Whoever gets the messages of several rigs must see whose it is.
                 named = news.model_copy(update={"text": f"{self._rig}: {news.text}"})
                 text = named.model_dump_json().encode()
@@ -78,10 +85,6 @@ class Hooks:
                     _call(public_url(url), words, b"%s\n%s" % (url.encode(), text), limit_s, posts=True)
             if self._ended:
                 return
-
-    def _concerns(self, news: News) -> bool:
-        fault = news.kind == "state" and news.state is State.FAULTED and news.level == "error"
-        return ("fault" if fault else news.kind) in self._config.on
 
 
 def _call(name: str, words: list[str], text: bytes, limit_s: float, *, posts: bool = False) -> None:
@@ -101,7 +104,12 @@ def _call(name: str, words: list[str], text: bytes, limit_s: float, *, posts: bo
         why, _ = process.communicate(text, limit_s + START_S * posts)
     except subprocess.TimeoutExpired:
         log.warning("hook %s timed out after %g s", name, limit_s)
-        _give_up(name, process)
+        try:
+            os.killpg(process.pid, signal.SIGKILL)  # with its children
+            process.communicate(timeout=END_S)
+        except (OSError, subprocess.TimeoutExpired) as error:
+            # A command that became another user cannot be killed, and is left alone.
+            log.warning("hook %s cannot be ended: %s", name, error)
         return
     if posts and process.returncode == -signal.SIGALRM:
         log.warning("hook %s timed out after %g s", name, limit_s)
@@ -109,12 +117,3 @@ def _call(name: str, words: list[str], text: bytes, limit_s: float, *, posts: bo
         log.warning("hook %s: %s", name, why.decode(errors="replace"))
     elif process.returncode:
         log.warning("hook %s ended with exit code %d", name, process.returncode)
-
-
-def _give_up(name: str, process: subprocess.Popen[bytes]) -> None:
-    """Kill a command with its children; one that cannot be killed, such as another user's, is left alone."""
-    try:
-        os.killpg(process.pid, signal.SIGKILL)
-        process.communicate(timeout=END_S)
-    except (OSError, subprocess.TimeoutExpired) as error:
-        log.warning("hook %s cannot be ended: %s", name, error)

@@ -80,6 +80,7 @@ class Local:
             )
         done: list[Reloaded] = []
         who = WHO.get() or "the control socket"
+        # Between the two, another reload may be applied: `apply` compares with what holds by then.
         new, apply = await asyncio.to_thread(self._reloading.read, who), self._reloading.apply
         await self._run(lambda: done.append(apply(new, who)))
         return done[0]

@@ -68,7 +68,7 @@ class NewsLog:
         """Return the news after ``last_id``, or all; preceded by a 'missed' if some are not kept any more."""
         with self._lock:
             life, _, number = (last_id or "").partition("-")
-            ours = life == self.life and number.isdecimal()
+            ours = life == self.life and number.isdecimal()  # it comes from a client, and may be anything
             seen = int(number) if ours else 0
             first = self._count - len(self._kept) + 1
             news = [one for k, one in enumerate(self._kept, first) if k > seen]
@@ -130,7 +130,12 @@ class Changes:
                 text = f"arm {arm} lost {lines - reported} lines: {cause.replace('_', ' ')}"
                 found.append(_fact("loss", text, "error", arm=arm, lines=lines - reported))
         if before is not None and same_run:
-            found += _verdicts(before, status) + _segment(before, status)
+            found += _verdicts(before, status)
+            was, now = before.recording, status.recording
+            if was is not None and now is not None and was.path != now.path:
+                found.append(
+                    _fact("segment", f"{was.path} continues in {now.path}", "warning", path=now.path)
+                )
         known = {one.text: one.times for one in before.troubles} if before else {}
         new = [one for one in status.troubles if one.times > known.get(one.text, 0)]
         troubles = [_fact("trouble", one.text, "error") for one in new]
@@ -167,14 +172,6 @@ def _verdicts(before: Status, after: Status) -> list[dict[str, Any]]:
         text = f"arm {arm}: the light's code is {verdict}{shift}"
         found.append(_fact("verdict", text, level, arm=arm, line=new.checked_line))
     return found
-
-
-def _segment(before: Status, after: Status) -> list[dict[str, Any]]:
-    """Report that a recording continues in a further segment."""
-    old, new = before.recording, after.recording
-    if old is None or new is None or old.path == new.path:
-        return []
-    return [_fact("segment", f"{old.path} continues in {new.path}", "warning", path=new.path)]
 
 
 def _waiting(before: Status | None, after: Status) -> list[dict[str, Any]]:

@@ -14,10 +14,12 @@ def notify(message: str) -> bool:
     address = os.environ.get("NOTIFY_SOCKET", "")
     if not address.startswith(("/", "@")):
         return False
-    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_NONBLOCK) as sender:
-        # "@" stands for the NUL byte with which an abstract address begins.
-        try:
-            sender.sendto(message.encode(), address.replace("@", "\0", 1) if address[0] == "@" else address)
-        except OSError:
-            return False
+    # "@" stands for the NUL byte with which an abstract address begins.
+    to = address.replace("@", "\0", 1) if address[0] == "@" else address
+    try:
+        # Even the socket may be refused, with no descriptor left, which is no reason to be killed by systemd.
+        with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_NONBLOCK) as sender:
+            sender.sendto(message.encode(), to)
+    except OSError:
+        return False
     return True

@@ -36,7 +36,9 @@ def connect(path: Path, timeout_s: float) -> socket.socket:
             try:
                 connection.connect(str(path))
                 break
-            except BlockingIOError:  # the queue of waiting connections is full: the daemon is busy
+            # The queue of waiting connections is full: the daemon is busy. A Unix socket with a timeout does
+            # not wait for its place in the queue, as one of TCP does.
+            except BlockingIOError:
                 if time.monotonic() > deadline:
                     raise
                 time.sleep(_AGAIN_S)

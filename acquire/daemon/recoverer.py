@@ -115,7 +115,11 @@ def _salvage(mailbox: Mailbox, task: Task) -> RecoveryStatus:
         reason = f"{RECOVERED}{task.why}" if task.why else Circumstances().reason
         # Not `alone`: without locks nothing shows whether another process still writes the recording.
         known = Circumstances(reason, has_run_on(attributes or {}), alone=False, notes=task.notes)
-        done = recover(path, progress=lambda *_: _check_owner(mailbox), known=known)
+
+        def look(_checked: int, _chunks: int) -> None:
+            mailbox.take()  # raises OwnerGone, which ends the process, once nobody waits for the recovery
+
+        done = recover(path, progress=look, known=known)
     except StateError as error:
         return RecoveryStatus(path=path, state="waiting", text=error.message)
     except FileNotFoundError:
@@ -132,11 +136,6 @@ def _salvage(mailbox: Mailbox, task: Task) -> RecoveryStatus:
     return RecoveryStatus(
         path=path, state="recovered", lines=done.lines, condition=sealed["run_condition"], text=text
     )
-
-
-def _check_owner(mailbox: Mailbox) -> None:
-    """End the process, by an exception, once its owner has gone."""
-    mailbox.take()
 
 
 def _gone(task: Task) -> str:

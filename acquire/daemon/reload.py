@@ -89,16 +89,15 @@ class Reloading:
 
 def changes(old: RigConfig, new: RigConfig) -> list[ChangedKey]:
     """Return every dotted key whose value differs; for an added or removed table, the table."""
-    changed = _differences(
-        "", old.model_dump(mode="json", context=WHOLE), new.model_dump(mode="json", context=WHOLE)
-    )
-    return [_public(one) if one.key == "hooks.webhook" else one for one in changed]
-
-
-def _public(one: ChangedKey) -> ChangedKey:
-    """Return the change without the secrets of its URLs, since it is noted in the log and in recordings."""
-    old, new = (url and public_url(url) for url in (one.old, one.new))
-    return ChangedKey(key=one.key, old=old, new=new, holds=one.holds)
+    # With the secrets, without which a change of only these would not be noticed.
+    whole = (one.model_dump(mode="json", context=WHOLE) for one in (old, new))
+    changed = list(_differences("", *whole))
+    for number, one in enumerate(changed):
+        # Without the secrets of its URLs: changes are noted in the log and in recordings.
+        if one.key == "hooks.webhook":
+            public = {which: url and public_url(url) for which, url in (("old", one.old), ("new", one.new))}
+            changed[number] = one.model_copy(update=public)
+    return changed
 
 
 def _differences(key: str, old: Any, new: Any) -> Iterator[ChangedKey]:

@@ -251,13 +251,13 @@ class Daemon:
                 self._hung_up = asyncio.create_task(self._reload())
             return
         if self._ending.is_set():
-            log.warning("%s again: ending without waiting for lines on the way", number.name)
             self._service.hurry()
             self._last_resort.within(END_S)
+            log.warning("%s again: ending without waiting for lines on the way", number.name)
             return
-        log.info("%s: ending", number.name)
         # The devices have one thread: the shutdown cannot begin before the current command has ended.
         busy = self._service.status().busy is not None
         self._last_resort.within(END_S + (COMMAND_S if busy else 0.0))
+        log.info("%s: ending", number.name)  # only now: a log that takes no text holds this thread up
         self._exit_code = EXIT_INTERRUPTED if number is signal.SIGINT else 0
         self._ending.set()

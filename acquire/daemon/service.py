@@ -172,6 +172,7 @@ class Service:
             try:
                 self._release()
             finally:
+                # Whatever closing it raised, the run is gone: armed without one, every command would fail.
                 self._go(Event.DISARM)
 
     def sign(self, command: str, who: str) -> None:

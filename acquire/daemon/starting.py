@@ -51,6 +51,8 @@ def _socket_of(words: list[str], environment: bytes) -> str | None:
 
 def _listens(process: Path) -> bool:
     """Return whether the process listens on a Unix socket already, which must be another one."""
+    # The columns of proc(5): flags in the fourth, the inode in the seventh, then the path. A socket without a
+    # path is none that a client could mean.
     rows = [row.split() for row in (process / "net" / "unix").read_text(errors="replace").splitlines()[1:]]
     accepting = {f"socket:[{row[6]}]" for row in rows if row[3] == ACCEPTS and len(row) > 7}
     for descriptor in (process / "fd").iterdir():

@@ -18,7 +18,6 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from acquire.config import RigConfig
-    from acquire.config.recording import RetentionConfig
     from acquire.store import CodecChoice
 
 SAMPLE_BYTES = 4 * 2**20
@@ -30,14 +29,25 @@ def storage_settings(config: RigConfig) -> dict[str, Any]:
     recording = config.recording
     # Whole chunks of tags, since a line can be committed only once its tags are on disk, too.
     whole = config.chunk_lines * config.tag_chunks
+    retention, rate_hz = None, config.line_rate_hz
+    if (kept := recording.retention) is not None:
+        depth = Geometry(config.geometry.stages, config.geometry.substeps, 1).depth_lines
+        retention = Retention(
+            max_bytes=None if kept.max_gb is None else round(kept.max_gb * 1e9),
+            max_age_lines=None if kept.max_age_s is None else ceil(kept.max_age_s * rate_hz),
+            margin_lines=depth + kept.segment_lines,
+            hold_events=kept.hold_events,
+            hold_lines=(ceil(kept.hold_before_s * rate_hz), ceil(kept.hold_after_s * rate_hz)),
+            copied_to=recording.upload_to,
+        )
     return {
         "chunk_lines": config.chunk_lines,
         "shard_chunks": recording.shard_chunks,
         "fsync": recording.fsync,
         "tag_chunks": config.tag_chunks,
-        "commit_lines": ceil(recording.commit_s * config.line_rate_hz / whole) * whole,
+        "commit_lines": ceil(recording.commit_s * rate_hz / whole) * whole,
         "reserve_bytes": round(recording.reserve_gb * 1e9),
-        "retention": recording.retention and _retention(recording.retention, config),
+        "retention": retention,
     }
 
 
@@ -65,16 +75,3 @@ def shot_noise(config: RigConfig) -> NDArray[Any]:
     # Noise is hardly compressible: a codec that sustains it sustains a scene, too.
     light = np.random.default_rng(0).poisson(camera.white_dn / 2, (count, pixels))
     return np.minimum(light, camera.white_dn).astype(camera.dtype)
-
-
-def _retention(config: RetentionConfig, rig: RigConfig) -> Retention:
-    rate = rig.line_rate_hz
-    depth = Geometry(rig.geometry.stages, rig.geometry.substeps, 1).depth_lines
-    return Retention(
-        max_bytes=None if config.max_gb is None else round(config.max_gb * 1e9),
-        max_age_lines=None if config.max_age_s is None else ceil(config.max_age_s * rate),
-        margin_lines=depth + config.segment_lines,
-        hold_events=config.hold_events,
-        hold_lines=(ceil(config.hold_before_s * rate), ceil(config.hold_after_s * rate)),
-        copied_to=rig.recording.upload_to,
-    )

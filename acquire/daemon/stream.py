@@ -61,7 +61,7 @@ class Streams:
         loop, woken = asyncio.get_running_loop(), asyncio.Event()
 
         def wake() -> None:
-            if not loop.is_closed():
+            if not loop.is_closed():  # the devices' thread may still report how a run was closed
                 loop.call_soon_threadsafe(woken.set)
 
         # Not in `open`: a stream that is never begun would never reach `finally`.

@@ -28,6 +28,8 @@ SOCKET = "/run/acquire/acquire.sock"
 """Default socket of the host's service."""
 RULES = "70-acquire.rules"
 
+# Class ef, subclass 05 is the control interface of USB3 Vision; 1209 is the vendor of a trigger that is a USB
+# device itself, 0403 (FTDI) that of the serial port on its board.
 UDEV = """\
 # The sync trigger and USB3 Vision cameras belong to the group `plugdev`: no root is needed to use them.
 SUBSYSTEM=="usb", ENV{ID_USB_INTERFACES}=="*:ef0500:*", MODE="0660", GROUP="plugdev", TAG+="uaccess"
@@ -66,7 +68,7 @@ def unit_text(rig: RigConfig, config: Path, *, user: bool, account: str | None =
     listens = "" if socket == default_socket() else f" --socket {_word(socket.absolute())}"
     service = [
         "Type=notify",
-        "NotifyAccess=main",
+        "NotifyAccess=main",  # the watchdog listens to the daemon alone, not to what it has started
         f"ExecStart={command}",
         f"ExecReload={python} -m acquire reload{listens}",
         *([] if user else [f"User={who}"]),
@@ -96,6 +98,8 @@ def unit_text(rig: RigConfig, config: Path, *, user: bool, account: str | None =
             "[Unit]",
             f"Description=acquire, the capture service of rig {rig.name}",
             *([] if user else ["After=network.target time-sync.target"]),
+            # systemd gives up after five starts in 10 s by default: with RestartSec=1, a disk that is mounted
+            # a little late would find the service down for good.
             "StartLimitIntervalSec=60",
             "StartLimitBurst=10",
             "",

@@ -203,6 +203,7 @@ class Uploads:
     def _list(self, status: UploadStatus) -> None:
         before = self._found.pop(status.path, None)  # the latest come last
         self._found[status.path] = status
+        # The journal lists what is left: it changes only when a recording is done, or begins anew.
         was_left = before is not None and before.state not in _OVER
         if was_left == (status.state not in _OVER):
             return

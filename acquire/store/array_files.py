@@ -33,6 +33,7 @@ class ArrayFiles:
     @property
     def most_bytes(self) -> int:
         """Largest possible size of a chunk in its file, however badly it was packed."""
+        # blosc adds 16 bytes to what it cannot pack; twice the size leaves other programs' codecs some room.
         return 2 * self.shape.chunk_bytes + PAGE
 
     @property

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     Check = Callable[[Any], None]
     """Raises `_WrongError` for a value that is not valid."""
 
-MOST_LINES = 2**62
+MOST_LINES = 2**62  # the sum of a first line and a count still fits the 64 bits of tables and arrays
 
 
 class _WrongError(ValueError):

@@ -103,6 +103,7 @@ def stored_size(header: bytes, size: int, codec: Codec) -> int:
     """Return the size on disk, with checksum, of a chunk of ``size`` bytes by its header; 0 without one."""
     if len(header) < BLOSC_HEADER:
         return size + CRC_BYTES if codec == "none" else 0
+    # Without a codec there is no header: a chunk has its full size, wherever it is.
     stored = size if codec == "none" else int(struct.unpack_from("<12xI", header)[0])
     return stored + CRC_BYTES
 

@@ -68,7 +68,7 @@ def compare(
 
     Raises DataError if one of them cannot be read.
     """
-    shift = second.first_line
+    shift = second.first_line  # a copy counts from 0, and may begin with a later line of the original
     asked, have = first.lines - shift, second.lines
     count = Difference(ROWS, abs(asked - have), min(asked, have), str(asked), str(have))
     found = [] if asked == have else [count]

@@ -123,6 +123,7 @@ class _FarDelivery:
     def __init__(self, url: str) -> None:
         self._target = RemoteSource(url)
         _check_free(self._target)
+        # A rest there must not make a group that was delivered a failure.
         self._directory = tempfile.TemporaryDirectory(prefix="acquire-", ignore_cleanup_errors=True)
         self.partial = Path(self._directory.name) / "group.zarr"
 

@@ -29,6 +29,7 @@ if TYPE_CHECKING:
 SCRATCH = ".next"
 """Name under which a recording's new metadata is prepared, next to the shards of its first array."""
 
+# Never a file that exists, nor one to which a link of that name leads.
 _NEW = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC
 _WRITABLE = stat.S_IWUSR | stat.S_IWGRP | stat.S_IWOTH
 
@@ -111,23 +112,21 @@ class ShardFile:
 
     def write_pages(self, parts: Sequence[Buffer], offset: int) -> None:
         """Write whole pages from page-aligned memory at ``offset``, a multiple of the page."""
-        if self.direct and self._write_direct(parts, offset):
-            return
+        if self.direct:
+            try:
+                write_all(self._direct, parts, offset)
+            except OSError as error:
+                # The file system wants larger pages, or took a part: from now on all goes through the cache.
+                if error.errno != errno.EINVAL:
+                    raise
+                os.close(self._direct)
+                self._direct = -1
+            else:
+                return
         self.write(parts, offset)
         # Drop the pages of the previous write: the kernel keeps pages that are not on the disk yet.
         os.posix_fadvise(self._fd, *self._cached, os.POSIX_FADV_DONTNEED)
         self._cached = offset, sum(memoryview(part).nbytes for part in parts)
-
-    def _write_direct(self, parts: Sequence[Buffer], offset: int) -> bool:
-        """Return False once the file system refuses direct writes: it wants larger pages, or took a part."""
-        try:
-            write_all(self._direct, parts, offset)
-        except OSError as error:
-            if error.errno != errno.EINVAL:
-                raise
-            os.close(self._direct)
-            self._direct = -1
-        return self.direct
 
     def write(self, parts: Sequence[Buffer], offset: int) -> None:
         """Write bytes anywhere, through the page cache."""

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 _BOOT_ID = Path("/proc/sys/kernel/random/boot_id")
 
 
-@cache
+@cache  # every commit asks, and a process does not outlive a boot
 def this_host() -> dict[str, str]:
     """Return the machine's name, and a number that is different after every boot, for a recording's root."""
     try:

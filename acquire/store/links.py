@@ -29,6 +29,7 @@ def refuse_links(root: Path) -> None:
     refuse_link(root, root)
     if not any(os.path.lexists(root / part) for part in ("zarr.json", *ARMS)):
         return
+    # A list and not `os.walk`, which would pass over a directory that cannot be read.
     waiting = [str(root)]
     while waiting:
         try:

@@ -337,7 +337,7 @@ class Mirror:
             own = group_document(node["attributes"], inner) if node["node_type"] == "group" else node
             self._put(f"{key}/zarr.json", to_json(own))
         self._put("zarr.json", root)  # last, since readers begin with it
-        self._root = root
+        self._root = root  # only now: after a failure, the next step has to publish once more
 
     def _dropped(self, recording: Recording, lines: int) -> list[list[int]]:
         """Return the ranges of lines that retention deleted here before they could be copied."""

@@ -55,6 +55,7 @@ class MosaicWriter(VideoWriter):
             self._time_ns, self.frames, self._side = time_ns, len(time_ns), side
             shape_of_errors = (self.frames, tiles[0] * regions, tiles[1] * regions)
             self._error = np.full(shape_of_errors, NOT_THERE, np.float32)
+            # Sum and number: the mean of a frame is known once its last tile is, and tiles are not kept.
             self._squares = np.zeros((2, self.frames))
             # Of its full length from the beginning: a tile may be put whole before the next one has a frame.
             self._levels[0].resize((self.frames, *shape))

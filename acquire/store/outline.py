@@ -213,6 +213,7 @@ class Outline:
 
     def _disk_facts(self) -> dict[str, float] | None:
         """Return, of a local growing recording, bytes free, bytes per second, and seconds to a full disk."""
+        # A sealed one does not grow, and of a store nobody knows the room.
         if self.state == "sealed" or not isinstance(self.source, LocalSource) or not self.lines:
             return None
         free = DISK.free_bytes(self.source.path)

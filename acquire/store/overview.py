@@ -106,7 +106,7 @@ def write_overview(
         arm.widen(step)
     arrays = {name: arm.rows(lines, spec.dtype) for name, arm in passing.items()}
     count = len(next(iter(arrays.values())))
-    if not count:
+    if not count:  # too short for a first row
         return {}
     documents = {name: _document(rows, ("line", "pixel"), ROWS) for name, rows in arrays.items()}
     arrays["line"] = (spec.first_line + step * np.arange(count)).astype("<u8")

@@ -66,7 +66,8 @@ class Recording(Outline):
     arms: Mapping[str, CameraStream]
 
     def _arm(self, arm: str, documents: dict[str, Document]) -> CameraStream:
-        return CameraStream(self.source, arm, documents, self.first_line, self._open)
+        # Not `self.group` itself, which would import zarr: most recordings are read without it.
+        return CameraStream(self.source, arm, documents, self.first_line, lambda: self.group)
 
     def __repr__(self) -> str:
         state = self.attrs["run_condition"] or self.state
@@ -106,9 +107,6 @@ class Recording(Outline):
         import zarr
 
         return zarr.open_group(self.source.zarr_store(), mode="r", zarr_format=3)
-
-    def _open(self) -> zarr.Group:
-        return self.group
 
     def end_ns(self) -> int | None:
         """Return the UTC at which the line after the last one is read out; None without lines."""
@@ -220,6 +218,7 @@ class Recording(Outline):
 
     def _rows(self, first_line: int, lines: int) -> tuple[int, int]:
         start = first_line - self.first_line
+        # First: dropped lines count among the recording's, and the second check would let them pass.
         for first, count in self.dropped:
             if lines > 0 and first < first_line + lines and first_line < first + count:
                 raise DataError(

@@ -107,6 +107,7 @@ def _arms(path: Path, attributes: dict[str, Any]) -> dict[str, layout.Document]:
         shapes = {key: layout.parse_line_array(node) for key, node in nodes.items()}
         rows = min(rows for _, rows in shapes.values())
         if attributes.get("state") != "sealed":
+            # Only `seal` writes a part of a chunk: until then the newest rows of an array are whole chunks.
             rows -= rows % max(shape.chunk_rows for shape, _ in shapes.values())
             # Lines that retention dropped were committed, although an array may not state them yet.
             first_line = int(attributes["first_line"])

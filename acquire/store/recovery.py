@@ -218,7 +218,11 @@ class _Recoverer:
             lost = lost[: len(here)]
             for cause, rows in (("damaged", missing & lost), ("unlisted", missing & ~lost)):
                 for first, count in runs(rows, self.recording.first_line + here.start):
-                    gaps[cause] = _joined(gaps[cause], first, count, cause)
+                    begin, known = first, gaps[cause]
+                    # A gap that reaches the end of a chunk continues in the next one.
+                    if known and known[-1][0] + known[-1][1] == first:
+                        begin = known.pop()[0]
+                    known.append((begin, first + count - begin, cause))
         return sorted(gap for of_cause in gaps.values() for gap in of_cause)
 
     def _flag_chunk(self, found: ArmScan, chunk: int, lost: NDArray[np.bool_]) -> NDArray[np.bool_]:
@@ -335,14 +339,6 @@ class _Recoverer:
             kept = min(count, end - first)
             if kept > 0:
                 missing[cause] = missing.get(cause, 0) + kept
+        # No other count is left to compare with: the recorder's own has died with it.
         stored = self.rows - sum(missing.values())
         return {"stored": stored, "missing": missing, "balanced": True}
-
-
-def _joined(
-    gaps: list[tuple[int, int, str]], first: int, count: int, cause: str
-) -> list[tuple[int, int, str]]:
-    """Return ``gaps`` with one more, joined with the last one if it continues it."""
-    if gaps and gaps[-1][0] + gaps[-1][1] == first and gaps[-1][2] == cause:
-        return [*gaps[:-1], (gaps[-1][0], gaps[-1][1] + count, cause)]
-    return [*gaps, (first, count, cause)]

@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 
     from acquire.errors import AcquireError
 
+# With EINVAL, by which FAT and network disks refuse some characters in a name.
 NOT_A_PLACE = (
     errno.EACCES,
     errno.EEXIST,

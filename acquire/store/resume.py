@@ -49,6 +49,7 @@ def next_segment(path: Path, spec: RecordingSpec, cause: str = "interrupted") ->
             possible=first.attrs["segment"]["of"],
         )
     _check_alike(first, spec)
+    # All of them sealed: where an open one ends, and so the outage, is known once it is recovered.
     segments = [first, *first.segments]
     last = segments[-1]
     if any(segment.state != "sealed" for segment in segments):

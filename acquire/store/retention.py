@@ -78,7 +78,7 @@ def hold(path: Path, first_line: int, count: int, why: str = "", disk: Disk = DI
     text = json.dumps({"first_line": first_line, "count": count, "why": why}).encode()
     try:
         disk.make_directory(directory, parents=True)
-        name = f"{first_line}-{count}.json"
+        name = f"{first_line}-{count}.json"  # the same lines, held again, replace their file
         Publisher(directory / f".{name}", disk).replace(directory / name, text, durable=True)
     except OSError as error:
         raise refusal(f"{path}: lines {first_line} to {first_line + count - 1}", error, "held") from error
@@ -103,6 +103,7 @@ def keep_from(path: Path, line: int, url: str, disk: Disk = DISK) -> None:
     refuse_link(path, _holds(path))
     try:
         disk.make_directory(_holds(path), parents=True)
+        # A scratch file of its own, beside that of `hold`: the two are different processes.
         Publisher(_holds(path) / ".copy", disk).replace(_copy_hold(path, url), text, durable=True)
     except OSError as error:
         raise refusal(f"{path}: lines from {line} on", error, "held") from error
@@ -207,20 +208,18 @@ class Keeper:
         """
         # Read the holds again: shards may have been held since they were chosen.
         held = [hold.lines for hold in self._marks()]
-        saved = [shard for shard in shards if self._held(shard, held) or not self._delete(shard)]
-        for shard in saved:
+        saved = []
+        for shard in shards:
+            if not self._held(shard, held):
+                try:
+                    remove(self.disk, self.path, Dropped(shard, self.gone))
+                    continue
+                except DataError:  # its files are links by now, and stay
+                    self.odd.add(shard)
+            saved.append(shard)
             self.gone = _without(self.gone, shard)
             self.sizes[shard] = shard_bytes(self.path, shard)
         return saved
-
-    def _delete(self, shard: int) -> bool:
-        """Delete a shard; return False if its files are links by now, which stay."""
-        try:
-            remove(self.disk, self.path, Dropped(shard, self.gone))
-        except DataError:
-            self.odd.add(shard)
-            return False
-        return True
 
     def attributes(self) -> dict[str, Any]:
         """Return the attributes ``dropped`` and ``holds`` for the recording's root."""

@@ -46,7 +46,7 @@ class RoomWatch:
         self._begun_s = self._due_s = time.monotonic()
         self._bytes = 0
         self._rate = 0.0
-        self.room = Room(2**63, 0.0)
+        self.room = Room(2**63, 0.0)  # until the first query, nothing is known to be short
 
     def look(self, bytes_written: int) -> Room:
         """Return the disk's room after ``bytes_written``; queried once per `LOOK_S`. Raises OSError."""

@@ -54,7 +54,13 @@ class ArmScan:
         """Yield the damage within the first ``rows`` rows; joins adjacent chunks with the same trouble."""
         for array, troubles in self.troubles.items():
             size = self.stream.reader(array).shape.chunk_rows
-            for chunks, what in _stretches(troubles):
+            joined: list[tuple[range, str]] = []
+            for chunk in sorted(troubles):
+                begin, what = chunk, troubles[chunk]
+                if joined and joined[-1] == (range(joined[-1][0].start, chunk), what):
+                    begin = joined.pop()[0].start
+                joined.append((range(begin, chunk + 1), what))
+            for chunks, what in joined:
                 start, stop = chunks.start * size, min(rows, chunks.stop * size)
                 if start < stop:
                     yield Damage(self.stream.arm, array, self.stream.first_line + start, stop - start, what)
@@ -121,13 +127,3 @@ def runs(rows: NDArray[np.bool_], start: int) -> list[tuple[int, int]]:
     """Return the runs of True as (first, count), counted from ``start``."""
     edges = np.flatnonzero(np.diff(np.concatenate(([0], rows.view(np.int8), [0]))))
     return [(start + int(low), int(high - low)) for low, high in edges.reshape(-1, 2)]
-
-
-def _stretches(troubles: dict[int, str]) -> Iterator[tuple[range, str]]:
-    numbers = sorted(troubles)
-    while numbers:
-        first = end = numbers[0]
-        while numbers and numbers[0] == end and troubles[end] == troubles[first]:
-            numbers.pop(0)
-            end += 1
-        yield range(first, end), troubles[first]

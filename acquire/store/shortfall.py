@@ -8,7 +8,7 @@ their loss is recorded already.
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass
-from functools import cache, partial
+from functools import cache
 from typing import TYPE_CHECKING, Any
 
 from acquire.errors import AcquireError
@@ -43,8 +43,14 @@ class Damage:
 
 def shortfalls(recording: Outline, shards: range | None = None) -> Iterator[Damage]:
     """Yield the shortfalls of a recording, or of some shards. Raises DataError if gaps cannot be read."""
-    # Opened with its lines at most once, and only if a file is gone.
-    whole = cache(partial(_with_lines, recording))
+
+    @cache
+    def whole() -> Recording:
+        # At most once, and only if a file is gone: array libraries are slow to load.
+        from acquire.store.reader import open_source
+
+        return open_source(recording.source)
+
     for arm, files in recording.arms.items():
         lost = sorted(recording.lost_rows(arm), key=lambda rows: rows.start)
         for name in COLUMNS:
@@ -118,13 +124,6 @@ def _outside(lost: list[range], stretches: Iterable[range]) -> Iterator[range]:
             start = max(start, gone.stop)
         if start < rows.stop:
             yield range(start, rows.stop)
-
-
-def _with_lines(recording: Outline) -> Recording:
-    # Imported here, since array libraries are slow to load, and needed only if something is gone.
-    from acquire.store.reader import open_source
-
-    return open_source(recording.source)
 
 
 def _unflagged(whole: Callable[[], Recording], arm: str, rows: range) -> Iterator[range]:

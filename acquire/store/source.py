@@ -102,4 +102,5 @@ def source_of(place: Path | str) -> Source:
     if not is_url(place):
         return LocalSource(path_of(place))
     remote = RemoteSource(str(place))
+    # A file:// URL is a path: read directly, it is faster, and a pipe in it is refused.
     return remote if remote.path is None else LocalSource(remote.path)

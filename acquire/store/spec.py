@@ -210,6 +210,7 @@ class RecordingSpec:
             for key in CAMERA_KEYS:
                 if key not in self.cameras.get(arm, {}):
                     raise UsageError(f"a recording needs {key} of camera {arm}", possible="a number")
+        # They would be replaced without a word: see `root_attributes`.
         clash = sorted(set(self.extra) & set(_own_attributes(self, None)))
         if clash:
             raise UsageError(f"extra attributes {', '.join(clash)} are the format's own")

@@ -22,6 +22,8 @@ if TYPE_CHECKING:
 
     from acquire.store.files import Disk, Publisher
 
+# A table is one chunk of its whole capacity, which is written at every commit with a new row: larger ones
+# would cost the disk more than the lines of a slow camera.
 GAP_ROWS = 16384
 EVENT_ROWS = 4096
 

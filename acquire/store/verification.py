@@ -149,7 +149,7 @@ def _read_tags(recording: Recording, found: ArmScan) -> tuple[int | None, int]:
     for chunk in chunks_of(size, recording.kept_rows()):
         if chunk in found.troubles["flags"] or chunk in found.troubles["code_index"]:
             return None, misnumbered
-        rows = min(size, recording.lines - chunk * size)
+        rows = min(size, recording.lines - chunk * size)  # the rest of the last chunk is padding
         # Chunk by chunk: the tags of a recording of days do not fit into memory.
         missing = missing_rows(found.stream.reader("flags").chunk(chunk)[:rows])
         flagged += int(missing.sum())

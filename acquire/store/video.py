@@ -113,6 +113,7 @@ class VideoFile:
         found = (self.attrs.get("provenance") or {}).get("trusted")
         if found is None:
             return None
+        # Within the frames there are, whatever another program has written.
         first, end = (min(max(int(edge), 0), len(self.time_ns)) for edge in found)
         return range(first, max(first, end))
 

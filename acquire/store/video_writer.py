@@ -128,6 +128,7 @@ class VideoWriter:
         """Mark the trusted frames, write the metadata, and deliver the video."""
         first, end = provenance.get("trusted") or (0, 0)
         with refused(self._place, "written"):
+            # Only now: the trusted frames of the last range are known after it was solved.
             if "trusted" in provenance:
                 frame = np.arange(self.frames)
                 column = _column(self._group, "trusted", "bool", layout.TRUSTED_ATTRIBUTES)

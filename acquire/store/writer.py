@@ -129,7 +129,7 @@ class RecordingWriter:
         try:
             writer = cls(path, spec, disk)
             writer._create_parts()
-        except (AcquireError, MemoryError):
+        except (AcquireError, MemoryError):  # the buffers of the chunks are allocated here
             if writer is not None:
                 writer.close()
             remove(disk, path, Unborn(0))
@@ -141,6 +141,7 @@ class RecordingWriter:
 
         Raises StoreError if the disk refuses; then nothing is left behind.
         """
+        # Chosen only now, since the lines go on while the parts are created.
         self.spec = replace(self.spec, first_line=first_line)
         for arm in self._arms.values():
             arm.begin(first_line)

@@ -132,8 +132,8 @@ class Capture:
 
     def stop(self, reason: str = "stopped") -> None:
         """End the recording at the newest line; `poll` reports when it is sealed. Idempotent."""
-        newest_line = max((ring.newest_line for ring in self._rings.values()), default=0)
-        self._running("stop").end_recording(reason, newest_line)
+        supervisor = self._running("stop")  # first: the rings of a capture that is closed are unmapped
+        supervisor.end_recording(reason, max(ring.newest_line for ring in self._rings.values()))
 
     def poll(self) -> CaptureStatus:
         """Return the current status; after `close`, the final one."""
@@ -291,9 +291,12 @@ class Capture:
 
     def _status(self, supervisor: Supervisor) -> CaptureStatus:
         began, sealed, counters = supervisor.life.began, supervisor.life.sealed, self._counters[RECORDER]
+        rings = {arm: asdict(self._rings[arm].statistics()) for arm in ARMS}
+        for counts in rings.values():
+            counts["drops"] = counts.pop("dropped_blocks")  # its name in the status, which clients read
         status = CaptureStatus(
             accounts={arm: self._account(arm, supervisor) for arm in ARMS},
-            ring={arm: self._ring_counts(arm) for arm in ARMS},
+            ring=rings,
             lines={arm: self._line_counts(arm, began=began is not None) for arm in ARMS},
             waiting=self._waiting(supervisor),
             fault=supervisor.fault,
@@ -346,11 +349,6 @@ class Capture:
         lines = min(ring.room_lines for ring in rings)
         more = f"{lines * period_ns / 1e9:.0f} s" if period_ns else f"{lines} lines"
         return f"the rings hold {more} more"
-
-    def _ring_counts(self, arm: str) -> dict[str, int]:
-        counts = asdict(self._rings[arm].statistics())
-        counts["drops"] = counts.pop("dropped_blocks")
-        return counts
 
     def _lost(self, arm: str) -> dict[str, int]:
         grabbed, recorded = self._counters[arm], self._counters[RECORDER]

@@ -175,19 +175,15 @@ class Intake:
         self._away = False
         self._away_for = Cause.DEVICE_LOST
         if plan.successor:
-            self._take_over()
-
-    def _take_over(self) -> None:
-        """Continue for a grabber that died: lines after its last slot are lost."""
-        ring, counters = self._ring, self._counters
-        self._next = ring.newest_line
-        lost = sum(counters[cause] for cause in (*CAMERA_CAUSES, Cause.GRABBER_LOST))
-        # Losses that the dead grabber had counted and not committed yet are located, and counted, once more.
-        excess = ring.committed_lines + ring.statistics().dropped_lines + lost - self._next
-        counters.add(Cause.GRABBER_LOST, -max(0, excess))
-        self._clock.take_over(counters["stamp_line"], counters["stamp_ns"], counters["drift_ppb"])
-        self._away_for = Cause.GRABBER_LOST
-        self.realign()
+            # Lines after the last slot of the dead grabber are lost. Losses that it had counted and not
+            # committed yet are located, and counted, once more.
+            self._next = ring.newest_line
+            lost = sum(counters[cause] for cause in (*CAMERA_CAUSES, Cause.GRABBER_LOST))
+            excess = ring.committed_lines + ring.statistics().dropped_lines + lost - self._next
+            counters.add(Cause.GRABBER_LOST, -max(0, excess))
+            self._clock.take_over(counters["stamp_line"], counters["stamp_ns"], counters["drift_ppb"])
+            self._away_for = Cause.GRABBER_LOST
+            self.realign()
 
     def realign(self) -> None:
         """Note that the camera was opened again and counts from 0; its next time stamp gives the line."""

@@ -170,7 +170,13 @@ class Ring:
             self._memory.words(shape.control_words + k * _HEADER_WORDS, _HEADER_WORDS)
             for k in range(shape.slots)
         ]
-        self._slots = [self._view(k) for k in range(shape.slots)]
+        self._slots: list[Slot] = []
+        for k in range(shape.slots):
+            at = shape.flags_offset + k * shape.rows * 2
+            flags = np.frombuffer(self._memory.map, np.uint16, shape.rows, at)
+            at = shape.pixels_offset + k * shape.slot_stride
+            pixels = np.frombuffer(self._memory.map, shape.dtype, shape.rows * shape.width, at)
+            self._slots.append(Slot(pixels.reshape(shape.rows, shape.width), flags))
 
     # ---- producer
 
@@ -187,11 +193,19 @@ class Ring:
 
     def commit(self, first_line: int, count: int, losses: Sequence[Loss] = ()) -> None:
         """Hand over the claimed slot's first ``count`` rows, as lines from ``first_line`` on."""
+        if len(losses) > MAX_LOSSES:
+            raise UsageError(
+                f"one ring slot cannot have {len(losses)} losses before it", possible=f"up to {MAX_LOSSES}"
+            )
         head, total = self._control[_HEAD], self.committed_lines + count
         header = self._headers[head % self.shape.slots]
         header[_FIRST_LINE], header[_COUNT] = first_line, count
         header[_TIME_NS], header[_TOTAL] = time.monotonic_ns(), total
-        _write_losses(header, losses)
+        for position, loss in enumerate(losses):
+            at = _LOSSES + 3 * position
+            header[at], header[at + 1] = loss.first_line, loss.count
+            header[at + 2] = _CAUSES.index(loss.cause)
+        header[_LOSS_COUNT] = len(losses)
         # After the header's words: a reader that finds it even finds the words of this block.
         header[_SEQUENCE] = 2 * head + 2
         self._control[_NEWEST] = first_line + count
@@ -238,7 +252,10 @@ class Ring:
         oldest = min(tail, self._oldest())
         self._control[_TAIL] = oldest  # first keep the producer away, then check which blocks are left
         # The producer may have claimed the oldest slots between our read of the head and this store.
-        while oldest < tail and not (self.is_whole(oldest) and self._end_line(oldest) > first_line):
+        while oldest < tail:
+            header = self._header(oldest)
+            if self.is_whole(oldest) and header[_FIRST_LINE] + header[_COUNT] > first_line:
+                break
             oldest += 1
             self._control[_TAIL] = oldest
         headers = map(self._header, range(oldest, tail))
@@ -344,12 +361,18 @@ class Ring:
         if not self.is_whole(number):
             return None
         count = header[_COUNT]
+        losses: tuple[Loss, ...] = ()
+        if header[_LOSS_COUNT]:
+            words = iter(header[_LOSSES : _LOSSES + 3 * header[_LOSS_COUNT]].tolist())
+            losses = tuple(
+                Loss(first, lost, _CAUSES[why]) for first, lost, why in zip(words, words, words, strict=True)
+            )
         block = RingBlock(
             first_line=header[_FIRST_LINE],
             pixels=slot.pixels[:count],
             flags=slot.flags[:count],
             time_ns=header[_TIME_NS],
-            losses=_read_losses(header) if header[_LOSS_COUNT] else (),
+            losses=losses,
         )
         return block if self.is_whole(number) else None  # the header may be another block's by now
 
@@ -402,43 +425,11 @@ class Ring:
     def _header(self, number: int) -> memoryview:
         return self._headers[number % self.shape.slots]
 
-    def _end_line(self, number: int) -> int:
-        header = self._header(number)
-        return int(header[_FIRST_LINE] + header[_COUNT])
-
     def _torn(self, number: int) -> DataError:
         return DataError(
             f"ring {self.name}: block {number} is torn or stale (sequence {self._header(number)[_SEQUENCE]})",
             possible=f"sequence {2 * number + 2} while exactly one process produces and one consumes",
         )
-
-    def _view(self, index: int) -> Slot:
-        shape = self.shape
-        flags_offset = shape.flags_offset + index * shape.rows * 2
-        flags = np.frombuffer(self._memory.map, np.uint16, shape.rows, flags_offset)
-        pixels_offset = shape.pixels_offset + index * shape.slot_stride
-        pixels = np.frombuffer(self._memory.map, shape.dtype, shape.rows * shape.width, pixels_offset)
-        return Slot(pixels.reshape(shape.rows, shape.width), flags)
-
-
-def _write_losses(header: memoryview, losses: Sequence[Loss]) -> None:
-    if len(losses) > MAX_LOSSES:
-        raise UsageError(
-            f"one ring slot cannot have {len(losses)} losses before it", possible=f"up to {MAX_LOSSES}"
-        )
-    for position, loss in enumerate(losses):
-        at = _LOSSES + 3 * position
-        header[at], header[at + 1] = loss.first_line, loss.count
-        header[at + 2] = _CAUSES.index(loss.cause)
-    header[_LOSS_COUNT] = len(losses)
-
-
-def _read_losses(header: memoryview) -> tuple[Loss, ...]:
-    words = header[_LOSSES : _LOSSES + 3 * header[_LOSS_COUNT]].tolist()
-    return tuple(
-        Loss(first, count, _CAUSES[cause])
-        for first, count, cause in zip(words[::3], words[1::3], words[2::3], strict=True)
-    )
 
 
 def _page_up(size: int) -> int:

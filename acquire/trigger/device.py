@@ -71,6 +71,7 @@ class Device:
     def __init__(self, link: Link) -> None:
         """Read the constants, and compare versions: the error names both."""
         self.link = link
+        # All constants, of which QUEUES is the last, in one round trip.
         last = r.QUEUES
         values = _values(r.ID.address, link.read(r.ID.address, last.address + last.words))
         name = link.transport.name

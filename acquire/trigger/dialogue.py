@@ -97,6 +97,7 @@ class Dialogue:
     """
 
     def __init__(self, name: str, bytes_per_s: float, silence_s: float, attempts: int) -> None:
+        # Until the device has stated its queue, one frame with its delimiter is certain to have room.
         self.window_bytes = MAX_ENCODED + 1
         """Limit of unanswered requests, or of their answers; to be raised to the device's capacity."""
         self.longest_s = 0.0

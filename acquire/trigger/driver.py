@@ -201,6 +201,7 @@ class TriggerDriver:
             ticks = device.line_ticks()
             status = device.await_status(lambda status: status.at_rest, ANSWER_S, "end", ticks)
             self._owed = 0
+            # Both waits of `tags`, for the link or for a run, would wait for tags that do not come any more.
             device.link.interrupt()
             with self._stopped:
                 self._stopped.notify_all()
@@ -210,7 +211,7 @@ class TriggerDriver:
         """Return counters of device, link and driver; without a link the latest ones, and ``link_lost``."""
         device, tags = self._device, self._tags
         known = tags.statistics() if tags else dict(TagReader.NOTHING)
-        if device is None:
+        if device is None:  # not connected: counting must not open the port
             return {"pulses": 0, **known}
         link = {"link": device.link.statistics()}
         if device.link.dead is not None:
@@ -247,7 +248,7 @@ class TriggerDriver:
     def reopen(self) -> Reunion:
         """Reconnect, and return the state of the run. Nothing is started or stopped."""
         with self._lock:
-            self.release()
+            self.release()  # also a link that lives: its port can be opened once
             run, status = self._run or self._prepared, self.device().status()
             if run is None:
                 return Reunion(None, False, None, status)

@@ -125,7 +125,7 @@ class Link:
     def tags(self, timeout_s: float) -> list[TagArrival]:
         """Return the tags since the last call; wait up to ``timeout_s`` for the first, or for `interrupt`."""
         with self._news:
-            self._interrupted = False
+            self._interrupted = False  # an earlier one was meant for an earlier wait
             self._news.wait_for(lambda: self._tags or self._dead or self._interrupted, timeout_s)
             if not self._tags and self._dead:
                 raise self._dead
@@ -150,6 +150,7 @@ class Link:
         # file.
         self._ending.set()
         self._die(TriggerError(f"{self.transport.name} was closed"))
+        # A read returns after `READ_WAIT_S`: this takes longer only if the port's driver hangs.
         self._reader.join(_END_S)
         self.transport.close()
 
@@ -187,5 +188,5 @@ class Link:
 
     def _die(self, error: TriggerError) -> None:
         with self._news:
-            self._dead = self._dead or error
+            self._dead = self._dead or error  # the first: what fails after it is a consequence
             self._news.notify_all()

@@ -45,6 +45,7 @@ def blink(hz: float, substep_ticks: int, device: Capabilities) -> SquareWave:
             possible=f"{slowest:.3g} to {fastest:.6g} Hz, with sub-steps of {substep_ticks} ticks",
         )
     half_ticks = device.clock_hz / (2 * hz)
+    # The smallest multiple with which half a period fits into half of the code memory.
     longer = int(-(-half_ticks // (substep_ticks * (device.code_bits // 2))))
     ticks = min(longer * substep_ticks, device.substep_ticks_max)
     return SquareWave(max(1, round(half_ticks / ticks)), ticks)

@@ -220,6 +220,7 @@ TAG_FIELDS = (("run", 32), ("line", 48), ("code_index", 64), ("timestamp", TIME_
 """Name → bits of a tag's payload, in the order of its bytes, each little endian: 26 bytes."""
 TAG_BYTES = sum(bits for _, bits in TAG_FIELDS) // 8
 
+# The fields of 48 bits are two each, the low one first: `struct` has no such integer.
 _TAG = struct.Struct("<IIHQIHH")
 
 

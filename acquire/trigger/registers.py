@@ -329,6 +329,7 @@ CONFIGURATION = tuple(register for register in REGISTERS if register.access == "
 
 def map_crc() -> int:
     """Return the CRC-32 of everything in the map on which a program can depend, without explanations."""
+    # Without the explanations, so that a better text does not part a program from its device.
     parts: list[object] = [
         [(r.name, r.address, r.access, r.width, r.reset) for r in REGISTERS],
         [(r.name, f.name, f.low, f.width) for r in REGISTERS for f in r.fields],

@@ -165,6 +165,7 @@ def with_window(config: TriggerConfig, window: LightWindow) -> TriggerConfig:
 
 
 def _check_timing(run: TriggerRun, config: TriggerConfig, device: Capabilities, distance: int) -> None:
+    # The clock first: everything else is in its ticks.
     if config.clock_hz != device.clock_hz:
         raise TriggerError(
             f"trigger.clock_hz is {config.clock_hz} Hz, which is not the clock of this device",
@@ -224,6 +225,7 @@ def _check_watchdog(config: TriggerConfig) -> None:
 
 def _code(attrs: Mapping[str, Any], device: Capabilities) -> dict[r.Register, int]:
     """Return the registers of the code; those that its source does not need are as after power-up."""
+    # Also those that the source does not need: every register of the configuration is written and compared.
     values = {r.CODE_SOURCE: 0, r.CODE_LENGTH: 0, r.PRBS_MASK: 0, r.PRBS_SEED: 0}
     kind = attrs.get("kind")
     if kind == "constant":
@@ -284,6 +286,7 @@ def pulse_width_ticks(configured: int | None, distance: int) -> int:
 
 def _output(output: LineOutputConfig, arm: str, distance: int, device: Capabilities) -> dict[r.Register, int]:
     width = pulse_width_ticks(output.width_ticks, distance)
+    # A pulse that lasts until the next one begins is one long pulse to the camera.
     if output.enable and output.delay_ticks + width >= distance:
         raise TriggerError(
             f"the pulse of camera {arm} is {width} ticks wide and {output.delay_ticks} late: too much",

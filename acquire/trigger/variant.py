@@ -62,6 +62,7 @@ class GatewareTrigger(TriggerVariant):
 
     def check(self, config: RigConfig) -> None:
         trigger = config.trigger
+        # As `prepare` would, so that a rig is refused when its file is read, and not when it is armed.
         run = TriggerRun(
             "check",
             config.code.build(),

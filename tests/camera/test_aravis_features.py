@@ -19,7 +19,7 @@ from acquire.camera.aravis import FAKE, AravisCamera, AravisOpener, load
 from acquire.camera.aravis.stream import RECEIVE_BYTES
 from acquire.camera.settings import Setting, apply_settings
 from acquire.camera.spec import GenicamSpec
-from acquire.errors import CameraError
+from acquire.errors import CameraError, CameraLostError
 from acquire.sim.gige.camera import Transmission
 
 pytestmark = pytest.mark.needs_aravis
@@ -283,3 +283,39 @@ def test_a_slow_frame_whose_packets_trickle_in_is_whole() -> None:
             assert blocks == [(0, False), (50, False), (100, False)]
         finally:
             camera.close()
+
+
+def test_frames_that_were_fetched_from_a_camera_that_is_gone_are_freed(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Each has the memory of a frame, and was lost whenever a camera went away while frames waited."""
+    fetched, freed = set(), set()
+
+    class Watched:
+        def __getattr__(self, name: str) -> object:
+            return getattr(load(), name)
+
+        def arv_stream_timeout_pop_buffer(self, stream: int, wait_us: int) -> int | None:
+            fetched.add(buffer := load().arv_stream_timeout_pop_buffer(stream, wait_us))
+            return buffer
+
+        def g_object_unref(self, thing: int) -> None:
+            freed.add(thing)
+            load().g_object_unref(thing)
+
+    def gone() -> int:
+        raise CameraError("no answer")
+
+    with our_camera(50, Transmission()) as (sensor, address):
+        camera = open_in_time(AravisOpener(spec_at(address, 50)))
+        try:
+            camera.arm()
+            monkeypatch.setattr(camera, "_library", Watched())
+            monkeypatch.setattr(camera._missed, "count", gone)
+            sensor.allowed = 3 * 50
+            with pytest.raises(CameraLostError, match="no answer"):
+                until(lambda: camera.next_block(0.2), "a frame")
+        finally:
+            camera.close()
+    assert fetched - {None} <= freed
+    assert fetched - {None}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import resource
 import socket
@@ -70,6 +71,22 @@ def test_a_mount_with_a_space_in_its_name_is_found(monkeypatch: pytest.MonkeyPat
     monkeypatch.setattr(doctor, "_read", lambda _: mounts)
     assert doctor._file_system(Path("/mnt/lab disk/runs")) == "nfs4"
     assert doctor._file_system(Path("/mnt/lab")) == "ext4"
+
+
+def test_a_host_without_ipv6_is_told_that_of_its_page(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The socket itself is refused there, which ended the whole examination."""
+
+    class Ipv4(socket.socket):
+        def __init__(self, family: int = -1, *rest: int) -> None:
+            if family == socket.AF_INET6:
+                raise OSError(errno.EAFNOSUPPORT, "Address family not supported by protocol")
+            super().__init__(family, *rest)
+
+    monkeypatch.setattr("acquire.daemon.doctor.socket.socket", Ipv4)
+    one = found(rig_config(tmp_path, **{"web.host": "::1", "web.port": 8080}), "page")
+    assert (one.level, one.text) == ("warning", "::1:8080: Address family not supported by protocol")
 
 
 def test_a_port_that_is_taken_and_a_daemon_of_another_version(tmp_path: Path) -> None:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
+import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -93,3 +95,46 @@ def test_a_device_that_does_not_let_go_keeps_no_daemon_from_ending(tmp_path: Pat
     assert "ending by force: thread MainThread" in ended.stderr
     assert "thread devices_0 at" in ended.stderr
     assert not socket.exists()
+
+
+STOPPED = """
+import asyncio, contextlib, logging, os, pathlib, signal, sys
+sys.path.insert(0, sys.argv[2])
+from fake_run import FakeRun, rig_config
+from acquire.daemon import ending, server
+from acquire.daemon.endpoint import Endpoint
+from acquire.daemon.service import Service
+from acquire.logs import write_log
+server.END_S = ending.LINGER_S = 0.5
+socket = pathlib.Path(sys.argv[1])
+write_log(logging.ERROR)
+
+async def live():
+    daemon = server.Daemon(Service(rig_config(socket.parent), lambda _: FakeRun()), endpoint)
+    asyncio.get_running_loop().call_later(0.5, logging.getLogger().setLevel, logging.INFO)
+    asyncio.get_running_loop().call_later(1.0, os.kill, os.getpid(), signal.SIGTERM)
+    await daemon.run()
+
+with contextlib.closing(Endpoint(socket)) as endpoint:
+    asyncio.run(live())
+"""
+
+
+def test_a_terminal_that_takes_no_text_keeps_no_daemon_from_ending(tmp_path: Path) -> None:
+    """Ctrl-S, or a pager that nobody scrolls: the line "SIGTERM: ending" was waited for without limit."""
+    read, write = os.pipe()
+    os.set_blocking(write, False)
+    with contextlib.suppress(BlockingIOError):
+        while True:
+            os.write(write, bytes(4096))
+    os.set_blocking(write, True)
+    process = subprocess.Popen(
+        [sys.executable, "-c", STOPPED, tmp_path / "c.sock", Path(__file__).parent], stderr=write
+    )
+    try:
+        assert process.wait(60) == -signal.SIGALRM
+    finally:
+        process.kill()
+        process.wait()
+        os.close(read)
+        os.close(write)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import signal
+import sys
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
@@ -224,6 +225,16 @@ def test_a_process_that_is_killed_is_replaced(place: Place, caplog: pytest.LogCa
     uploads.add(place.write("x.zarr"))
     look_until(uploads, lambda: states(uploads) == {"x.zarr": "copied"})
     assert "killed by SIGKILL; it is replaced" in caplog.text
+
+
+def test_without_a_place_nothing_is_remembered(place: Place) -> None:
+    """Of every recording of a daemon that copies none, one more path was kept, for as long as it lived."""
+    uploads = place.daemon(None)
+    path = place.here / "run.zarr"
+    before = sys.getrefcount(path)
+    uploads.add(path)
+    assert sys.getrefcount(path) == before
+    assert (uploads.left, uploads.statuses) == (0, [])
 
 
 def test_waits_grow_and_are_bounded() -> None:

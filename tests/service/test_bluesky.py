@@ -29,7 +29,7 @@ from waiting import until
 
 from acquire.bluesky import Recorder, StartRequest
 from acquire.client import State
-from acquire.store import open_recording
+from acquire.store import Recording, open_recording
 
 DOCUMENT = Path(__file__).parents[2] / "acquire/client/SCRIPTING.md"
 
@@ -215,6 +215,24 @@ def test_impossible_requests_are_refused_with_an_explanation(
     with pytest.raises(NotConnectedError, match="no mock of the instrument"), init_devices(mock=True):
         mocked = Recorder(daemon.socket)
     assert mocked.name == "mocked"
+
+
+def test_no_look_at_a_recording_holds_up_the_engine_s_loop(
+    daemon: Daemon, engine: RunEngine, emitted: Emitted, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A network disk that hangs at the end of a recording would have stopped every other device's status."""
+    looking: set[threading.Thread] = set()
+
+    def looked(path: Path) -> Recording:
+        looking.add(threading.current_thread())
+        return open_recording(path)
+
+    monkeypatch.setattr("acquire.bluesky.recorder.open_recording", looked)
+    with init_devices():
+        recorder = Recorder(daemon.socket, name="recorder")
+    engine(fly(recorder, StartRequest(lines=300)))
+    assert looking
+    assert engine._th not in looking
 
 
 def test_an_aborted_plan_stops_the_recording(daemon: Daemon, engine: RunEngine, emitted: Emitted) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import json
 import os
+import time
 from dataclasses import replace
 
 import numpy as np
@@ -18,6 +19,7 @@ from acquire.store import Circumstances, Gap, RecordingWriter, RunCondition, ope
 from acquire.store.host import has_run_on, is_here
 from acquire.store.pages import PAGE
 from acquire.store.removal import COPY
+from acquire.store.scan import ArmScan
 from acquire.store.shape import index_bytes
 from acquire.store.source import LocalSource
 from acquire.store.table import EVENT_ROWS
@@ -365,3 +367,19 @@ def test_a_medium_that_cannot_be_read_is_damage(path, monkeypatch):
     assert {found.arm for found in verify(path).damage} == {"b"}
     with pytest.raises(DataError, match="cannot be read"):
         open_recording(path).cut(1064, 5)
+
+
+def test_a_disk_that_has_lost_most_of_a_long_recording_is_listed_in_a_moment(path):
+    """A day at 100 kHz has two million chunks in each array, which took ten minutes to join."""
+    stream = open_recording(write(path)).arms["a"]
+    size = stream.reader("lines").shape.chunk_rows
+    troubles = {chunk: "gone" if chunk % 3 else "damaged" for chunk in range(300_000)}
+    begun_s = time.process_time()
+    found = list(ArmScan(stream, {"lines": troubles}).damages(300_000 * size - 1))
+    assert time.process_time() - begun_s < 10
+    assert [(one.first_line - SPEC.first_line, one.count, one.what) for one in (*found[:3], found[-1])] == [
+        (0, size, "damaged"),
+        (size, 2 * size, "gone"),
+        (3 * size, size, "damaged"),
+        (299_998 * size, 2 * size - 1, "gone"),
+    ]

@@ -359,6 +359,16 @@ def test_close_seals_what_is_being_recorded(tmp_path: Path) -> None:
     assert (status.condition, status.end_reason) == (RunCondition.INTERRUPTED, "the capture was closed")
 
 
+def test_a_closed_capture_refuses_commands_in_words() -> None:
+    """`stop` asked the rings first, whose memory was unmapped: a ValueError about memoryview objects."""
+    bench = make_bench()
+    with armed(bench) as capture:
+        capture.close()
+        for command in (capture.stop, lambda: capture.note("mark", ""), lambda: capture.extend(1)):
+            with pytest.raises(StateError, match="this capture is not armed"):
+                command()
+
+
 def test_a_write_error_aborts_and_the_rings_are_emptied_all_the_same(tmp_path: Path) -> None:
     with armed(make_bench()) as capture:
         record_until(capture, tmp_path / "r.zarr", 1000)

@@ -139,7 +139,7 @@ class _GError(ctypes.Structure):
 @contextmanager
 def errors(what: str) -> Iterator[Any]:
     """Yield a place for a GError; raise CameraError if one was stored there."""
-    place = POINTER(_GError)()
+    place = POINTER(_GError)()  # NULL: GLib reports no error into a place that seems to have one
     yield byref(place)
     if ctypes.cast(place, c_void_p).value:
         message = (place.contents.message or b"").decode(errors="replace")

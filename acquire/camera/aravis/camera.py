@@ -149,6 +149,7 @@ class AravisCamera:
         """Return the bits of frame IDs, and whether they skip 0, as in GigE Vision and USB3 Vision."""
         if self._library.arv_camera_is_uv_device(self._camera):
             return self._spec.frame_id_bits or 64, False
+        # An option of GigE Vision 2, which a camera may have switched off, or not have at all.
         mode = self._features.find("GevGVSPExtendedIDMode")
         extended = mode is not None and mode.readable and mode.read() == "On"
         return self._spec.frame_id_bits or (64 if extended else 16), True
@@ -188,6 +189,8 @@ class AravisCamera:
         self._heard_s = time.monotonic()
         assert self._stream is not None
         assert self._assembly is not None
+        # Now, and not one by one: `disarm` has to free them also if the next lines find the camera gone.
+        self._taken.update(buffers)
         try:
             missed = self._missed.count()
         except CameraError as error:
@@ -199,9 +202,9 @@ class AravisCamera:
         for buffer in buffers:
             # The stream was ended before this buffer was filled: it stands for no frame.
             if self._library.arv_buffer_get_status(buffer) == _ABORTED:
+                self._taken.remove(buffer)
                 self._give(self._stream, buffer)
                 continue
-            self._taken.add(buffer)
             blocks, free = self._assembly.take(self._frame(buffer, underruns, missed))
             self._ready += blocks
             for idle in free:
@@ -244,7 +247,7 @@ class AravisCamera:
             raise CameraLostError(f"camera {self._spec.serial} is gone: it has restarted")
 
     def release(self, block: CameraBlock) -> None:
-        buffer = self._held.pop(block, None)
+        buffer = self._held.pop(block, None)  # none of a block from before `disarm`, which has freed it
         if buffer is not None and self._stream is not None:
             self._taken.remove(buffer)
             self._give(self._stream, buffer)

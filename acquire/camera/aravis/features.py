@@ -42,6 +42,7 @@ class AravisFeatures:
         if not node or self._is_category(node):
             return None
         # The kind determines how the node is read and written.
+        # GObject knows a type by its name only once there was an object of it, of this camera or another.
         kinds: Iterator[Kind] = (
             kind
             for name, kind in _KINDS
@@ -66,7 +67,7 @@ class AravisFeatures:
         for name in _strings(self._library.arv_gc_category_get_features(node)) if node else ():
             below = self._library.arv_device_get_feature(self._device, name.encode())
             if below and self._is_category(below):
-                if name not in found:
+                if name not in found:  # it may be listed in several, and even within itself
                     self._collect(name, found)
             elif below:
                 names.append(name)
@@ -75,6 +76,7 @@ class AravisFeatures:
 def _strings(node: int | None) -> Iterator[str]:
     """Yield the texts of a GSList."""
     while node:
+        # An element of it is two pointers: to its data, and to the next element.
         data, node = (c_void_p * 2).from_address(node)
         if data:
             yield ctypes.string_at(data).decode()
@@ -88,6 +90,8 @@ class AravisNode:
         self.name, self.kind = name, kind
         self._key = name.encode()
         self._word = {"enumeration": "string", "text": "string"}.get(kind, kind)
+
+    # ArvGcAccessMode: 0 can only be read, 1 only be written, 2 both; what is left cannot be accessed now.
 
     @property
     def readable(self) -> bool:

@@ -196,6 +196,7 @@ def _describe(library: Any, at: int, spec: _ParamSpec, kind: Kind) -> _Property:
     behind = at + ctypes.sizeof(_ParamSpec)
     entries: dict[str, int] = {}
     limits = (0.0, 0.0)
+    # GObject keeps a boolean as an int, and an enumeration as a long: of that, the low half is read here.
     field = "v_int"
     if kind == "enumeration":
         known = _EnumClass.from_address(c_void_p.from_address(behind).value or 0)

@@ -14,6 +14,8 @@ from pathlib import Path
 
 from acquire.errors import TriggerError
 
+# Not a directory for temporary files, of which a service may have one of its own (PrivateTmp=): the daemon
+# and a user's command would lock different files.
 SHARED = Path("/run/lock")
 _COMMAND_SHOWN = 80
 _LOOKED_AT_S = 0.1
@@ -88,7 +90,7 @@ def _open_for_all(path: Path) -> int:
         return os.open(path, os.O_RDWR | os.O_CLOEXEC)
     except FileNotFoundError:
         descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o666)
-        os.fchmod(descriptor, 0o666)
+        os.fchmod(descriptor, 0o666)  # of the mode above, the umask has taken what others need
         return descriptor
 
 

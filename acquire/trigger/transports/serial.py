@@ -100,7 +100,7 @@ class SerialTransport:
 
 def _lock_name(path: str) -> str:
     """Return one name per port, also for links to it."""
-    return str(Path(path).resolve())
+    return str(Path(path).resolve())  # /dev/serial/by-id/… is a link to what another rig calls /dev/ttyUSB0
 
 
 def _not_opened(url: str, error: Exception, local: bool) -> TriggerError:

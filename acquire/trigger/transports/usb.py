@@ -104,7 +104,7 @@ class UsbTransport:
 
     def close(self) -> None:
         usb.util.dispose_resources(self._device)
-        self._lock.release()
+        self._lock.release()  # last: whoever gets it finds the interface free
 
     def _find(self, vendor: int, product: int, serial: str, backend: Any) -> Any:
         # Read serial numbers only if one is given: it requires permission to open every device.
