@@ -57,11 +57,12 @@ preferred."""
 PERIOD_ROUNDS, LONG_STRIDE = 6, 4.0
 """Largest number of fits of a period, in turn with its cycle, and how much farther than the fit says it is
 moved at first: a cycle adapts to a wrong period, which then looks nearly right."""
-NEARLY_REPEATS = 1.3
+NEARLY_REPEATS, NO_CYCLE = 1.3, 4.0
 """Largest error of a cycle, relative to a rival's, for which its period is fitted: a tenth of a cycle too
-many makes 0.8 out of 0.6, and sometimes 1.15."""
-PARTS = (3, 2, 2)
-"""Parts of a period that are tried, one after the other."""
+many makes 0.8 out of 0.6, and sometimes 1.15. The other is that for which its first trial goes on: bright
+lines on dark ground begin at up to 2.8 and end at 0.7."""
+PARTS = (3, 2)
+"""Parts of a period that are tried, each as long as it helps."""
 PROBE, HOPELESS = 10, 2.5
 """Number of iterations after which a trial ends whose error is this many times that of a rival: the cosines'
 lead is 4 and more for lamps, and 1.3 to 2 for a flame or a scene that flickers as a whole."""
@@ -200,17 +201,21 @@ class Workbench:
         """Try a cycle of about this period, or of a part of it, since a multiple of a period is one, too."""
         best = self._cycle(period_frames, rival)
         for part in PARTS:
-            shorter = best.candidate.period_frames / part
-            if best.error < rival and shorter > 2 * FEWEST_HARMONICS and not self.clock.spent(SEARCH_SHARE):
+            while best.error < rival and not self.clock.spent(SEARCH_SHARE):
+                shorter = best.candidate.period_frames / part
+                if shorter < 2 * FEWEST_HARMONICS:
+                    break
                 found = self._cycle(shorter, best.error)
-                best = found if found.error <= best.error else best
+                if found.error > best.error:
+                    break
+                best = found
         return best
 
     def _cycle(self, period_frames: float, rival: float) -> Trial:
         """A cycle, whose period is fitted to the lines if it may yet predict better than a rival."""
         harmonics = min(CYCLE.coefficients // 2, int(period_frames / 2))
         cycle = replace(CYCLE, coefficients=2 * harmonics + 1, period_frames=period_frames)
-        found = self.probe(self.fitting(cycle), rival)
+        found = self.probe(self.fitting(cycle), rival, NO_CYCLE)
         return self.follow_period(found) if found.error < NEARLY_REPEATS * rival else found
 
     def follow_period(self, best: Trial) -> Trial:
@@ -290,11 +295,12 @@ class Workbench:
             self.clock.show("choose", partial(self.video, trial))
         return trial
 
-    def probe(self, candidate: Candidate, rival: float) -> Trial:
-        """Solve a candidate from zero, which ends early if it is far behind the error of a rival."""
+    def probe(self, candidate: Candidate, rival: float, hopeless: float = HOPELESS) -> Trial:
+        """Solve a candidate from zero; it ends early if its error is ``hopeless`` times that of a rival."""
         first = self.attempt(candidate, PROBE)
-        hopeless = first.error > HOPELESS * rival
-        return first if hopeless else self.attempt(candidate, FIRST_ITERATIONS - PROBE, first)
+        if first.error > hopeless * rival:
+            return first
+        return self.attempt(candidate, FIRST_ITERATIONS - PROBE, first)
 
     def record_errors(
         self, candidate: dict[str, Any], predicted: NDArray[Any], began: float | None = None
