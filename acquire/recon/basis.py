@@ -143,7 +143,7 @@ class CyclicBasis:
     """
 
     def __init__(self, frames: int, harmonics: int, period_frames: float, arrays: Arrays = HOST) -> None:
-        if not (period_frames > 0 and harmonics >= 0 and 2 * harmonics < min(frames, period_frames + 1)):
+        if not (period_frames > 0 and harmonics >= 0 and 2 * harmonics < min(frames, period_frames)):
             raise UsageError(
                 f"{frames} frames do not show {harmonics} harmonics of a period of {period_frames:g} frames",
                 possible="fewer than half as many harmonics as frames of a period",

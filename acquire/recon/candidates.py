@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Literal
 
 from acquire.recon.admm import AdmmParameters
 from acquire.recon.basis import CyclicBasis, TemporalBasis
+from acquire.recon.cycle import most_harmonics
 from acquire.recon.tv import FrameTv
 from acquire.recon.volume import Smooth, VolumeTv
 
@@ -84,7 +85,7 @@ class Candidate:
     def with_coefficients(self, step: int, frames: int) -> Candidate | None:
         """The candidate with the next number of coefficients in either direction; None beyond the limits."""
         if self.prior == "cycle":
-            counts = [2 * min(each, int(self.period_frames / 2)) + 1 for each in HARMONICS]
+            counts = [2 * min(each, most_harmonics(self.period_frames)) + 1 for each in HARMONICS]
         else:
             counts = [min(each, frames) for each in COSINES]
         further = [each for each in counts if (each - self.coefficients) * step > 0]

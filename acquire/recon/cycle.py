@@ -34,10 +34,16 @@ COMB, AS_GOOD = 0.15, 0.75
 """Share of the change beyond chance that a comb has to hold, and share of the best comb's from which a faster
 one is preferred: every multiple of a period is a period, too, which leaves more unknowns. Scenes that repeat
 have 0.22 to 0.9, others up to 0.14, but for text that scrolls and traffic."""
+SHARE_OF_NYQUIST = 0.9
 ROUNDING = 1e-10
 """Energy of a change, relative to that of the mean, below which it may be rounding."""
 NUDGE, FARTHEST = 0.01, 0.1
 """Difference in cycles for the derivative of the lines, and the largest change of one fit."""
+
+
+def most_harmonics(period_frames: float) -> int:
+    """The largest number of harmonics of a period: of one near half the frame rate, frames show one phase."""
+    return int(SHARE_OF_NYQUIST * period_frames / 2)
 
 
 def find_period(theta: Array, basis: Basis) -> float | None:
@@ -105,7 +111,7 @@ def better_period(
     # lines without light have no slope
     step = stride * float((slope * left).sum() / max(np.square(slope).sum(), np.finfo(np.float64).tiny))
     fitted = basis.frames / (cycles + min(max(step, -FARTHEST), FARTHEST))
-    return max(fitted, 2 * basis.harmonics)  # shorter ones have fewer harmonics
+    return max(fitted, 2 * basis.harmonics / SHARE_OF_NYQUIST)  # shorter ones have fewer harmonics
 
 
 def describe_cycle(period_frames: float, frame_ns: float) -> str:

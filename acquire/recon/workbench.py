@@ -20,7 +20,7 @@ from acquire.recon.band import band_operator
 from acquire.recon.basis import CyclicBasis, TemporalBasis, resized
 from acquire.recon.brightness import fit_brightness
 from acquire.recon.candidates import CALM, CYCLE, USUAL_ENERGY, VOLUME, Candidate, parameters
-from acquire.recon.cycle import FEWEST_HARMONICS, better_period
+from acquire.recon.cycle import FEWEST_HARMONICS, better_period, most_harmonics
 from acquire.recon.volume import VolumeTv
 
 if TYPE_CHECKING:
@@ -203,7 +203,7 @@ class Workbench:
         for part in PARTS:
             while best.error < rival and not self.clock.spent(SEARCH_SHARE):
                 shorter = best.candidate.period_frames / part
-                if shorter < 2 * FEWEST_HARMONICS:
+                if most_harmonics(shorter) < FEWEST_HARMONICS:
                     break
                 found = self._cycle(shorter, best.error)
                 if found.error > best.error:
@@ -213,7 +213,7 @@ class Workbench:
 
     def _cycle(self, period_frames: float, rival: float) -> Trial:
         """A cycle, whose period is fitted to the lines if it may yet predict better than a rival."""
-        harmonics = min(CYCLE.coefficients // 2, int(period_frames / 2))
+        harmonics = min(CYCLE.coefficients // 2, most_harmonics(period_frames))
         cycle = replace(CYCLE, coefficients=2 * harmonics + 1, period_frames=period_frames)
         found = self.probe(self.fitting(cycle), rival, NO_CYCLE)
         return self.follow_period(found) if found.error < NEARLY_REPEATS * rival else found

@@ -45,7 +45,7 @@ def test_the_harmonics_are_orthonormal_and_hold_what_repeats(
     frames: int, harmonics: int, cycles: float
 ) -> None:
     period = frames / cycles
-    if 2 * harmonics >= min(frames, period + 1):
+    if 2 * harmonics >= min(frames, period):
         with pytest.raises(UsageError, match="harmonics"):
             CyclicBasis(frames, harmonics, period)
         return

@@ -65,7 +65,7 @@ def test_a_calibration_takes_precedence_and_its_drift_is_reported(split: Path, t
         made = Calibration(offsets.instrument).with_step(offsets)
         known[name] = made.with_step(flat(exposures["flat"], made))
     now = provenance(split, tmp_path / "now-video.zarr", known["now"])
-    assert now["warnings"] == []
+    assert [text for text in now["warnings"] if "arm" in text] == []
     assert not now["balance"]["corrected"]
     assert now["balance"]["ratio"] == pytest.approx(1, abs=3 * now["balance"]["error"])
     before = provenance(split, tmp_path / "before-video.zarr", known["before"])
