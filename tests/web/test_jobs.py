@@ -180,7 +180,9 @@ def test_a_request_that_is_repeated_is_carried_out_once(tmp_path: Path) -> None:
         contextlib.closing(PageServer(socket, tmp_path)) as page,
         RecordingWriter.create(tmp_path / "r.zarr", make_spec()) as writer,
         httpx.Client(
-            base_url=f"{page.address}api", headers={"Authorization": f"Bearer {page.operator}"}
+            base_url=f"{page.address}api",
+            headers={"Authorization": f"Bearer {page.operator}"},
+            timeout=60,  # a job's process may take longer than the usual 5 s to start on a busy host
         ) as ask,
     ):
         fill(writer, 150)
