@@ -35,6 +35,7 @@ COMB, AS_GOOD = 0.15, 0.75
 one is preferred: every multiple of a period is a period, too, which leaves more unknowns. Scenes that repeat
 have 0.22 to 0.9, others up to 0.14, but for text that scrolls and traffic."""
 SHARE_OF_NYQUIST = 0.9
+"""Fastest harmonic, relative to half the frame rate, at which every frame would show the same phase."""
 ROUNDING = 1e-10
 """Energy of a change, relative to that of the mean, below which it may be rounding."""
 NUDGE, FARTHEST = 0.01, 0.1
@@ -42,7 +43,7 @@ NUDGE, FARTHEST = 0.01, 0.1
 
 
 def most_harmonics(period_frames: float) -> int:
-    """The largest number of harmonics of a period: of one near half the frame rate, frames show one phase."""
+    """The largest number of harmonics of a period that its frames show."""
     return int(SHARE_OF_NYQUIST * period_frames / 2)
 
 

@@ -207,6 +207,26 @@ def test_daemon_that_does_not_answer(path: Path, monkeypatch: pytest.MonkeyPatch
             client.status()
 
 
+@contextlib.contextmanager
+def answering(path: Path, answer: bytes) -> Iterator[Path]:
+    """A socket beside ``path`` whose server gives one connection this answer, whatever is asked."""
+    odd = path.with_name("odd.sock")
+    odd.unlink(missing_ok=True)
+    with socket.socket(socket.AF_UNIX) as listener:
+        listener.bind(str(odd))
+        listener.listen(1)
+
+        def reply() -> None:
+            with listener.accept()[0] as connection:
+                connection.recv(4096)
+                connection.sendall(answer)
+
+        thread = threading.Thread(target=reply)
+        thread.start()
+        yield odd
+        thread.join(300)
+
+
 @pytest.mark.parametrize(
     ("answer", "told"),
     [
@@ -224,22 +244,8 @@ def test_daemon_that_does_not_answer(path: Path, monkeypatch: pytest.MonkeyPatch
 def test_daemon_that_answers_strangely(
     path: Path, answer: bytes, told: str, ask: Callable[[Path], object]
 ) -> None:
-    odd = path.with_name("odd.sock")
-    odd.unlink(missing_ok=True)
-    with socket.socket(socket.AF_UNIX) as listener:
-        listener.bind(str(odd))
-        listener.listen(1)
-
-        def reply() -> None:
-            with listener.accept()[0] as connection:
-                connection.recv(4096)
-                connection.sendall(answer)
-
-        thread = threading.Thread(target=reply)
-        thread.start()
-        with pytest.raises(AcquireError, match=told):
-            ask(odd)
-        thread.join(300)
+    with answering(path, answer) as odd, pytest.raises(AcquireError, match=told):
+        ask(odd)
 
 
 @pytest.mark.parametrize(
@@ -251,22 +257,9 @@ def test_daemon_that_answers_strangely(
     ids=["blocking", "async"],
 )
 def test_news_that_are_no_text(path: Path, ask: Callable[[Path], object]) -> None:
-    odd = path.with_name("odd.sock")
-    odd.unlink(missing_ok=True)
-    with socket.socket(socket.AF_UNIX) as listener:
-        listener.bind(str(odd))
-        listener.listen(1)
-
-        def reply() -> None:
-            with listener.accept()[0] as connection:
-                connection.recv(4096)
-                connection.sendall(b"HTTP/1.1 200 OK\r\n\r\nevent: news\ndata: {\xff}\n\n")
-
-        thread = threading.Thread(target=reply)
-        thread.start()
-        with pytest.raises(AcquireError, match="another version"):
-            ask(odd)
-        thread.join(300)
+    text = b"HTTP/1.1 200 OK\r\n\r\nevent: news\ndata: {\xff}\n\n"
+    with answering(path, text) as odd, pytest.raises(AcquireError, match="another version"):
+        ask(odd)
 
 
 TREE = [
