@@ -1,15 +1,82 @@
-"""Lower rank of other processes than the capture's, for processors and when memory runs out."""
+"""Ranks of processes on the host, for processors and when memory runs out: lines come first.
+
+    urgent      grabbers with `stream.realtime`: ahead of everything else
+    prompt      every grabber: the next to run once it wakes up, for as little as it has to do
+    important   the recorder of a rig with `stream.realtime`: more processor time than others
+    back        what can be repeated: the page, its jobs, copies, recoveries
+
+Threads and processes that are started later inherit a rank.
+"""
 
 from __future__ import annotations
 
 import contextlib
+import ctypes
 import os
+import platform
 from pathlib import Path
 
 FIRST, EARLY = 1000, 500
 """Scores of processes that the kernel kills first, and next, when memory runs out: see proc(5),
 oom_score_adj.
 """
+_IMPORTANT = -15
+_SLICE_NS = 100_000
+"""The shortest that Linux allows, and more than a block of lines takes to copy."""
+_SCHED_SETATTR = {"x86_64": 314, "aarch64": 274}
+"""Numbers of a system call that the C library offers only since glibc 2.41."""
+
+
+class _Attributes(ctypes.Structure):
+    """``struct sched_attr`` of sched_setattr(2), in its first version."""
+
+    _fields_ = (
+        ("size", ctypes.c_uint32),
+        ("policy", ctypes.c_uint32),
+        ("flags", ctypes.c_uint64),
+        ("nice", ctypes.c_int32),
+        ("priority", ctypes.c_uint32),
+        ("runtime_ns", ctypes.c_uint64),
+        ("deadline_ns", ctypes.c_uint64),
+        ("period_ns", ctypes.c_uint64),
+    )
+
+
+def become_urgent() -> bool:
+    """Run ahead of everything else on the host, in real time; return whether that is allowed here.
+
+    Only for processes that wait most of the time and do little at once: others would starve the host.
+    """
+    try:
+        os.sched_setscheduler(0, os.SCHED_RR, os.sched_param(1))
+    except PermissionError:
+        return False
+    return True
+
+
+def become_prompt() -> bool:
+    """Ask for the processor in short slices, and therefore soon; return whether the kernel took the request.
+
+    Shares of the processors stay the same, and no right is needed. Without it, who runs when a block of lines
+    arrives may go on to the end of a slice of some milliseconds. Linux before 6.12 ignores it.
+    """
+    number = _SCHED_SETATTR.get(platform.machine())
+    if number is None or os.sched_getscheduler(0) != os.SCHED_OTHER:
+        return False
+    wanted = _Attributes(
+        size=ctypes.sizeof(_Attributes), policy=os.SCHED_OTHER, nice=os.nice(0), runtime_ns=_SLICE_NS
+    )
+    answer: int = ctypes.CDLL(None).syscall(number, 0, ctypes.byref(wanted), 0)
+    return answer == 0
+
+
+def become_important() -> bool:
+    """Get more processor time than other processes; return whether that is allowed here."""
+    try:
+        os.setpriority(os.PRIO_PROCESS, 0, _IMPORTANT)
+    except PermissionError:
+        return False
+    return True
 
 
 def stand_back(nice: int, oom_score: int) -> None:
@@ -20,3 +87,7 @@ def stand_back(nice: int, oom_score: int) -> None:
         os.sched_setscheduler(0, os.SCHED_BATCH, os.sched_param(0))
     with contextlib.suppress(OSError):  # a kernel without it, or a service that may not
         Path("/proc/self/oom_score_adj").write_text(str(oom_score), encoding="ascii")
+    # Where sessions share the processors (sched(7), autogroup), niceness counts only within one.
+    if os.getsid(0) == os.getpid():
+        with contextlib.suppress(OSError):  # a kernel without it
+            Path("/proc/self/autogroup").write_text(str(os.nice(0)), encoding="ascii")

@@ -11,7 +11,6 @@ import gc
 import logging
 import multiprocessing
 import multiprocessing.process
-import os
 import pickle
 import select
 import signal
@@ -39,8 +38,6 @@ _KILL_WAIT_S = 10.0
 disk."""
 _LAST_WORD_S = 0.1
 _LOOK_S = 0.1
-_IMPORTANT = -15
-"""Niceness, which threads started later inherit."""
 
 
 class OwnerGone(Exception):  # noqa: N818 - an event, not an error: the child ends in order
@@ -214,27 +211,6 @@ class Worker:
         self._child.close()
         if forced:
             raise DeviceError(f"{self.name}: the process did not end when told to, and was killed")
-
-
-def become_urgent() -> bool:
-    """Run ahead of everything else on the host, in real time; return whether that is allowed here.
-
-    Only for processes that wait most of the time and do little at once: others would starve the host.
-    """
-    try:
-        os.sched_setscheduler(0, os.SCHED_RR, os.sched_param(1))
-    except PermissionError:
-        return False
-    return True
-
-
-def become_important() -> bool:
-    """Get more processor time than other processes; return whether that is allowed here."""
-    try:
-        os.setpriority(os.PRIO_PROCESS, 0, _IMPORTANT)
-    except PermissionError:
-        return False
-    return True
 
 
 def _main(pipe: Connection[Any, Any], name: str, target: Callable[..., None], *args: Any) -> None:

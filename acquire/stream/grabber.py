@@ -21,7 +21,7 @@ from acquire.camera.base import LossCause
 from acquire.errors import AcquireError, CameraError, CameraLostError
 from acquire.lines import LineFlag
 from acquire.processes.messages import Ready
-from acquire.processes.worker import become_urgent
+from acquire.processes.rank import become_prompt, become_urgent
 from acquire.stream.lineclock import LineClock
 from acquire.stream.losses import Cause, Loss, LossLog
 
@@ -80,7 +80,10 @@ def grab(mailbox: Mailbox, *arms: tuple[GrabberPlan, Ring, Counters]) -> None:
     Several ``arms`` share one camera, each with its own columns.
     """
     plan = arms[0][0]  # the first arm's opener opens the camera that they share
-    urgent = plan.realtime and become_urgent()  # first, since a driver's threads inherit the priority
+    # First, since a driver's threads inherit the rank.
+    urgent = plan.realtime and become_urgent()
+    if not urgent:
+        become_prompt()
     camera = _open_again(mailbox, plan, "its grabber died") if plan.successor else plan.opener()
     intakes = [Intake(*arm) for arm in arms]
     try:

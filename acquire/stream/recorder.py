@@ -25,7 +25,8 @@ import numpy as np
 from acquire.errors import AcquireError, StateError, StoreError, UsageError
 from acquire.lines import ARMS
 from acquire.processes.messages import Ready
-from acquire.processes.worker import OwnerGone, become_important
+from acquire.processes.rank import become_important
+from acquire.processes.worker import OwnerGone
 from acquire.store import RecordingWriter, RunCondition
 from acquire.stream.external_counts import ExternalCounts
 from acquire.stream.kept import Kept
