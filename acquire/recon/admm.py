@@ -34,6 +34,7 @@ if TYPE_CHECKING:
     from acquire.recon.basis import Basis
     from acquire.recon.denoisers import Denoiser
     from acquire.recon.problem import MaskedOperator
+    from acquire.recon.sign import Sign
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,14 +69,15 @@ class Admm:
 
     ``samples`` are 0 where the operator's weight is. ``start`` is a first estimate, ``emphasis`` (K,)
     multiplies λ per coefficient frame, ``denoiser`` replaces total variation. ``background`` (K, n′, n′) is
-    light that is known already: its sum with the estimate is not negative.
+    light that is known already: its sum with the estimate is not negative. ``sign`` replaces the sign's split
+    where θ is no array of coefficient frames (`joined`).
     """
 
     def __init__(
         self,
         operator: MaskedOperator,
         samples: Array,
-        theta_shape: tuple[int, int, int],
+        theta_shape: tuple[int, ...],
         basis: Basis,
         parameters: AdmmParameters,
         *,
@@ -83,6 +85,7 @@ class Admm:
         emphasis: Array | float = 1.0,
         denoiser: Denoiser | None = None,
         background: Array | None = None,
+        sign: Sign | None = None,
     ) -> None:
         self._samples, self._parameters = samples, parameters
         tv = FrameTv(parameters.tv_iterations, joint=parameters.joint_tv)
@@ -95,7 +98,7 @@ class Admm:
         self.theta = arrays.zeros(theta_shape) if start is None else arrays.asarray(start)
         self._w, self._lifted = arrays.zeros(samples.shape), arrays.zeros(theta_shape)
         self._tv_multiplier = arrays.zeros(theta_shape)
-        self._sign = SignSplit(self._grid(basis), self.theta, background)
+        self._sign: Sign = sign or SignSplit(self.grid_of(basis, parameters), self.theta, background)
         self._prepare()
 
     def rebase(self, operator: MaskedOperator, basis: Basis, theta: Array) -> None:
@@ -106,15 +109,16 @@ class Admm:
         """
         self._operator, self.theta = operator, basis.arrays.asarray(theta)
         self._lifted = operator.adjoint(self._w)  # BᵀW·w
-        self._sign.rebase(self._grid(basis), self.theta.shape)
+        self._sign.rebase(self.grid_of(basis, self._parameters), self.theta.shape)
         self._prepare()
 
-    def _grid(self, basis: Basis) -> Array:
+    @staticmethod
+    def grid_of(basis: Basis, parameters: AdmmParameters) -> Array:
         """The basis at the instants of the sign's split, in cosines also for a basis of fewer curves.
 
         On fewer instants its rows would not be orthonormal.
         """
-        instants = min(basis.frames, self._parameters.grid_per_coefficient * basis.cosines)
+        instants = min(basis.frames, parameters.grid_per_coefficient * basis.cosines)
         return basis.arrays.asarray(basis.matrix(instants))
 
     def reweigh(self, parameters: AdmmParameters) -> None:

@@ -27,13 +27,14 @@ from acquire.recon.bandwidth import (
     light_beyond,
 )
 from acquire.recon.basis import TemporalBasis, resized
+from acquire.recon.beside_motion import BesideMotion, find_lamps
 from acquire.recon.estimates import InBand, Refined
 from acquire.recon.patterns import PARAMETERS, ROUND, Refinement, find_patterns
 from acquire.recon.pursuit import pursue, widened
-from acquire.recon.settling import settle
+from acquire.recon.settling import CLEARLY, better_than, early_error, has_time, settle
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Callable, Iterator, Sequence
 
     from acquire.arrays import Array
     from acquire.lines import Segment
@@ -41,6 +42,7 @@ if TYPE_CHECKING:
     from acquire.recon.clock import IterationClock
     from acquire.recon.estimates import Estimate
     from acquire.recon.options import SolveOptions
+    from acquire.recon.patterns import Patterns
     from acquire.recon.problem import Problem
 
 GLANCE, FIRST_LOOK, LONGER_LOOK = 20, 60, 90
@@ -57,6 +59,8 @@ WIDER_SHARE = 0.5
 EXPLAINED_BY_NOISE, LEAST_MISSED = 1.25, 0.01
 """Held-out error relative to the noise above which a lamp may hide that the band mimics, and the error itself
 if the noise is unknown; the search for it takes a tenth of the time."""
+SOON_EXPLAINED = 1.5
+"""Held-out error of patterns after their first rounds, relative to the noise, up to which nothing moves."""
 TENTATIVE_SHARE = 0.15
 """Share of the budget after which the search for the bandwidth hurries."""
 LAMPS_SHARE = 0.3
@@ -321,22 +325,61 @@ def _in_patterns(
     first: InBand,
     clock: IterationClock,
 ) -> Estimate | None:
-    """Patterns and curves from a first look; None if the scene does not consist of a few."""
+    """Patterns and curves from a first look; None if the scene does not consist of a few.
+
+    If it is in doubt whether it does, or if they predict worse than the look, something may move beside them.
+    """
     # curves are fitted at the end of a round: less than one gains nothing
     if clock.done >= clock.iterations or not clock.affords(ROUND * clock.longest_s):
         return None
-    found = find_patterns(host(first.solver.theta))
-    if found is None:
-        return None
+    theta = host(first.solver.theta)
     basis = TemporalBasis(first.basis.frames, first.basis.cosines, problem.arrays)
-    found = replace(found, curves=host(first.basis.spread(problem.arrays.asarray(found.curves))))
-    merges = (options.spatial_merge, options.temporal_merge)
+    merges, parameters = (options.spatial_merge, options.temporal_merge), _for_noise(segment, problem, first)
+
+    def begin(kind: type[Refinement], found: Patterns) -> Refinement:
+        curves = host(first.basis.spread(problem.arrays.asarray(found.curves)))
+        return kind(segment, problem, basis, replace(found, curves=curves), merges, parameters)
+
+    alone = find_patterns(theta)
+    usual = None if alone is None else partial(begin, Refinement, alone)
+    rivals: list[Callable[[], Refinement]] = []
+    # each refinement of a large segment holds a video's worth of memory
+    if not is_large(segment.geometry, options.spatial_merge):
+        rivals = [partial(begin, BesideMotion, each) for each in find_lamps(theta, first.basis)]
+    error, noise = problem.prediction_error(first.predict()), problem.noise(segment)
+    explained = max(SOON_EXPLAINED * noise, LEAST_MISSED) if noise < np.inf else LEAST_MISSED  # NaN: unknown
     clock.reset()  # the limit holds for each stage: the first look takes longer where patterns are in doubt
-    refinement = Refinement(segment, problem, basis, found, merges, _for_noise(segment, problem, first))
-    refinement = settle(refinement, problem, clock)
+    refinement = None
+    if rivals and find_patterns(theta, beyond_doubt=True) is None and has_time(clock):
+        refinement = _beside_motion(usual, rivals, min(error, explained), problem, clock)
+        rivals = []
+    if refinement is None and usual is not None:
+        refinement = usual()
+    if refinement is not None:
+        refinement = settle(refinement, problem, clock)
+        left = problem.prediction_error(refinement.predict())
+        if rivals and left > min(error, explained) and has_time(clock):
+            other = better_than(left, rivals, problem, clock)
+            refinement = refinement if other is None else settle(other, problem, clock)
     # without held-out samples both are NaN
-    worse = problem.prediction_error(first.predict()) < problem.prediction_error(refinement.predict())
-    return None if worse else Refined(refinement, basis.count)
+    if refinement is None or error < problem.prediction_error(refinement.predict()):
+        return None
+    return Refined(refinement, basis.count)
+
+
+def _beside_motion(
+    usual: Callable[[], Refinement] | None,
+    rivals: Sequence[Callable[[], Refinement]],
+    enough: float,
+    problem: Problem,
+    clock: IterationClock,
+) -> Refinement | None:
+    """Patterns beside something that moves, unless the ``usual`` ones soon predict to ``enough``."""
+    bound = np.inf
+    if usual is not None:
+        soon = early_error(usual(), problem, clock)
+        bound = CLEARLY * soon if soon > enough else 0.0
+    return better_than(bound, rivals, problem, clock)
 
 
 def _for_noise(segment: Segment, problem: Problem, first: InBand) -> AdmmParameters:

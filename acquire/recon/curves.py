@@ -18,7 +18,7 @@ means the same however they are rotated; it and the noise σ² are those for whi
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -96,15 +96,18 @@ class CurveFit:
         self._damping = 0.0
         self.prior: CurvePrior | None = None
 
-    def __call__(self, patterns: Array, start: NDArray[Any]) -> NDArray[np.float64]:
+    def __call__(
+        self, patterns: Array, start: NDArray[Any], known_lines: NDArray[Any] | None = None
+    ) -> NDArray[np.float64]:
         """Fit curves (K, R) to the samples with ``patterns`` (R, n, n), near ``start``.
 
-        The fit is well conditioned if the patterns are of similar size.
+        The fit is well conditioned if the patterns are of similar size. ``known_lines`` are of other light.
         """
         arrays, exact = self._problem.arrays, self._problem.arrays.exact()
         whole = CurveOperator(self._segment, patterns, self._cosines, self._merge)
         operator = self._problem.masked(whole)
-        residual = self._problem.used_samples - operator.forward(arrays.asarray(start))
+        problem = self._problem if known_lines is None else replace(self._problem, known_lines=known_lines)
+        residual = problem.used_samples - operator.forward(arrays.asarray(start))
         gradient = host(exact.asarray(operator.adjoint(residual)))
         small = self._segment.geometry.span <= LARGEST_SPAN and start.size <= LARGEST_UNKNOWNS
         if small and self._calls % REFRESH == 0:

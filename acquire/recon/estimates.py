@@ -115,6 +115,9 @@ class Refined:
 
     def facts(self) -> dict[str, Any]:
         found = {"temporal_coefficients": self._coefficients, "patterns": self._refinement.rank}
+        motion = self._refinement.found.motion
+        if motion is not None:
+            found["motion_coefficients"] = int(motion.shape[0])
         return found | asdict(self._refinement.parameters)
 
     def continue_with(

@@ -83,11 +83,13 @@ iterates while patterns and curves are wrong would flatten them once they are ri
 class Patterns:
     """Θ = curves·patterns: (K, R) orthonormal columns, and (R, row, column) of decreasing energy.
 
-    Curves are on the host; patterns are on the device where they were computed.
+    Curves are on the host; patterns are on the device where they were computed. ``motion`` (K, n′, n′) are
+    coefficients of what moves beside them, if that is solved for as well (`beside_motion`).
     """
 
     curves: NDArray[Any]
     patterns: Array
+    motion: Array | None = None
 
 
 def find_patterns(theta: NDArray[Any], *, beyond_doubt: bool = False) -> Patterns | None:
@@ -155,7 +157,7 @@ class Refinement:
         n = segment.geometry.size
         # a voxel held over its pixels; the last may stand out of the picture
         fine = found.patterns.repeat(merge, axis=1).repeat(merge, axis=2)[:, :n, :n]
-        self._start(Patterns(found.curves, fine))
+        self._start(replace(found, patterns=fine))
 
     def _start(self, found: Patterns) -> None:
         """Begin ADMM, with the parameters of now, at patterns in pixels."""
@@ -165,16 +167,27 @@ class Refinement:
         size = np.sqrt(np.square(fine, dtype=np.float64).sum((1, 2)))
         # 1e-6: of a pattern that has faded altogether the weight stays finite
         emphasis = (size.max() / np.maximum(size, 1e-6 * size.max() + 1e-30)) ** FADING
-        self._admm = Admm(
-            operator,
-            self._problem.used_samples,
-            fine.shape,
-            basis,
-            self.parameters,
-            start=fine,
-            emphasis=emphasis,
-        )
-        self.found = Patterns(found.curves, self._admm.theta)
+        self._admm = self._solver(operator, basis, emphasis)
+        self.found = self._at(self.found.curves)
+
+    def _solver(self, operator: MaskedOperator, basis: LearnedBasis, emphasis: NDArray[Any]) -> Admm:
+        """ADMM from what is found."""
+        samples, start = self._problem.used_samples, self._theta
+        shape = tuple(start.shape)
+        return Admm(operator, samples, shape, basis, self.parameters, start=start, emphasis=emphasis)
+
+    @property
+    def _theta(self) -> Array:
+        """What is found, as the solver holds it."""
+        return self.found.patterns
+
+    def _at(self, curves: NDArray[Any]) -> Patterns:
+        """What the solver has now, with these curves."""
+        return Patterns(curves, self._admm.theta)
+
+    def _known_lines(self) -> NDArray[Any] | None:
+        """Lines, as `Problem.samples`, of what the curves are not fitted to."""
+        return None
 
     @property
     def rank(self) -> int:
@@ -187,12 +200,12 @@ class Refinement:
     def step(self) -> None:
         """Make one iteration. Raises NumericsError if the iterates are not finite."""
         self._admm.step()
-        self.found = Patterns(self.found.curves, self._admm.theta)
+        self.found = self._at(self.found.curves)
         self._steps += 1
         if self.at_round_end:
             self._fit_curves()
-            self._admm.rebase(*self._operators(), self.found.patterns)
-            self.found = Patterns(self.found.curves, self._admm.theta)
+            self._admm.rebase(*self._operators(), self._theta)
+            self.found = self._at(self.found.curves)
             if self.loosens:
                 weight = max(WEIGHT_DECAY * self.parameters.tv_weight, LEAST_WEIGHT * self._first.tv_weight)
                 self._reweigh(weight)
@@ -240,7 +253,7 @@ class Refinement:
         other._fit.prior = self._fit.prior
         operator, basis = other._operators()
         other._admm = self._admm.with_problem(operator, problem.used_samples, heavier)
-        other._admm.rebase(operator, basis, self.found.patterns)
+        other._admm.rebase(operator, basis, self._theta)
         return other
 
     def needed(self) -> Patterns:
@@ -257,7 +270,8 @@ class Refinement:
         def strongest(count: int) -> Patterns:
             kept = turn[:, :count]
             patterns = (kept.T @ flat).reshape(-1, *found.patterns.shape[1:])
-            return Patterns(found.curves @ kept, self._problem.arrays.asarray(patterns.astype(kept.dtype)))
+            patterns = self._problem.arrays.asarray(patterns.astype(kept.dtype))
+            return replace(found, curves=found.curves @ kept, patterns=patterns)
 
         noise = self._problem.noise(self.segment)
         floor = noise**2 if noise < np.inf else 0.0  # NaN if it is unknown
@@ -278,7 +292,7 @@ class Refinement:
 
     def predict(self) -> NDArray[Any]:
         """The lines of the estimate, as `Problem.samples`."""
-        return host(self._operator.forward(self.found.patterns)) / self._problem.norm
+        return host(self._operator.forward(self._theta)) / self._problem.norm
 
     def video(self) -> NDArray[Any]:
         """Dimensionless voxels (T/T_m, n/N_m, n/N_m)."""
@@ -305,10 +319,9 @@ class Refinement:
         # orthonormal patterns make the fit well conditioned; the curves take over their sizes for it
         unit = arrays.xp.reshape(arrays.asarray(exact.asarray(np.linalg.inv(root)) @ flat), patterns.shape)
         # curves of unit patterns, and then (solve) of the patterns as they were
-        fitted = self._fit(unit, self.found.curves @ root)
+        fitted = self._fit(unit, self.found.curves @ root, self._known_lines())
         left, middle, right = np.linalg.svd(np.linalg.solve(root.T, fitted.T).T, full_matrices=False)
         # left·right is the nearest orthonormal matrix; the patterns take the rest, so that Θ stays the same
         rotated = exact.asarray((right.T * middle) @ right) @ flat
-        self.found = Patterns(
-            (left @ right).astype(arrays.dtype), arrays.xp.reshape(arrays.asarray(rotated), patterns.shape)
-        )
+        patterns = arrays.xp.reshape(arrays.asarray(rotated), patterns.shape)
+        self.found = replace(self.found, curves=(left @ right).astype(arrays.dtype), patterns=patterns)

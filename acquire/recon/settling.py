@@ -18,6 +18,8 @@ import numpy as np
 from acquire.recon.patterns import ROUND
 
 if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+
     from acquire.recon.clock import IterationClock
     from acquire.recon.patterns import Refinement
     from acquire.recon.problem import Problem
@@ -41,6 +43,10 @@ has no time for that, nor to recover from patterns that fit noise."""
 FIRST_ROUND = 20.0
 """Time that the first round may take, relative to the longest iteration of the first look. It ends with a fit
 of the curves, which may take as long as ten to twenty of these; one that ends before gains nothing."""
+CLEARLY = 0.85
+"""Largest error of patterns beside motion, relative to that of patterns alone, for which they are preferred:
+lamps beside a dot have 0.4, lamps alone 0.9 and more. Also that of one pattern more: a lamp's has 0.4 to
+0.83, others 0.83 and more."""
 EARLY_ROUNDS = 2
 """Number of rounds before the first trial, in which both sides are refined for as many: what is superfluous
 mostly shows. The held-out error still rises and falls by a fifth."""
@@ -154,9 +160,39 @@ def _without_doubtful(refinement: Refinement, problem: Problem, clock: Iteration
     return fewer if _refine(fewer, TRIAL_ROUNDS, problem, clock) < error else refinement
 
 
+def has_time(clock: IterationClock) -> bool:
+    """Whether there is time to try refinements."""
+    return clock.iterations >= LONG and clock.affords(LONG * clock.longest_s)
+
+
+def early_error(refinement: Refinement, problem: Problem, clock: IterationClock) -> float:
+    """The held-out error after the first rounds."""
+    return _refine(refinement, EARLY_ROUNDS, problem, clock)
+
+
+def better_than(
+    bound: float, rivals: Sequence[Callable[[], Refinement]], problem: Problem, clock: IterationClock
+) -> Refinement | None:
+    """The best of refinements with more and more patterns, if its early error is below a ``bound``.
+
+    The first one that does not predict clearly better than the one before it ends the search: one pattern too
+    many takes what moves for a lamp, and predicts a little better for it.
+    """
+    best, least, before = None, bound, np.inf
+    for begin in rivals if bound > 0 else ():
+        refinement = begin()
+        error = early_error(refinement, problem, clock)
+        if error > CLEARLY * before:
+            break
+        best, least = (refinement, error) if error < least else (best, least)
+        before = error
+    clock.reset()
+    return best
+
+
 def _refine(refinement: Refinement, rounds: int, problem: Problem, clock: IterationClock) -> float:
     """Refine for some rounds and return the held-out error."""
-    for _ in clock.run(rounds * ROUND, "refine", video=refinement.video):
+    for _ in clock.run(rounds * ROUND, "refine", video=refinement.video, first=FIRST_ROUND):
         refinement.step()
     return problem.prediction_error(refinement.predict())
 

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import math
 from copy import copy
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, Protocol
 
 from array_api_compat import is_numpy_array
 
@@ -28,6 +28,22 @@ BLAS in large frames and as long in small ones, for 24 up to twice."""
 PART_PIXELS, PART_ROWS = 1 << 19, 4
 """Pixels of the instants that are handled together, 2 MB; and the fewest instants, relative to the number of
 coefficients: the product of fewer spends more time on the coefficients than on the instants."""
+
+
+class Sign(Protocol):
+    """What `admm` needs of a split of the sign; see `SignSplit`."""
+
+    def advance(self, theta: Array) -> None: ...
+
+    def pull(self) -> Array: ...
+
+    def rescale(self, factor: float) -> None: ...
+
+    def rebase(self, grid: Array, shape: tuple[int, ...]) -> None: ...
+
+    def resume(self, other: Any) -> None: ...
+
+    def copied(self) -> Sign: ...
 
 
 class SignSplit:

@@ -7,6 +7,7 @@ the host: what passes here neither calls numpy behind the solver's back nor copi
 from __future__ import annotations
 
 import sys
+from dataclasses import replace
 
 import array_api_strict
 import numpy as np
@@ -27,6 +28,7 @@ from acquire.lines import Segment
 from acquire.recon import HaarShrink, Reconstruction, reconstruct
 from acquire.recon.band import BandOperator
 from acquire.recon.basis import TemporalBasis
+from acquire.recon.beside_motion import BesideMotion
 from acquire.recon.patterns import ROUND, Refinement, find_patterns
 from acquire.recon.problem import build_problem
 from acquire.recon.tv import FrameTv
@@ -164,16 +166,19 @@ def test_every_trial_of_the_choice(device: str, scene: str, least_db: float) -> 
         assert psnr(result.video[result.trusted], given.truth(2, 1)) > least_db
 
 
-def test_patterns_and_curves(segment: Segment) -> None:
-    """Two rounds from the same patterns."""
+@pytest.mark.parametrize("kind", [Refinement, BesideMotion])
+def test_patterns_and_curves(segment: Segment, kind: type[Refinement]) -> None:
+    """Two rounds from the same patterns, alone and beside a volume."""
     noise = 1e-2 * np.random.default_rng(0).standard_normal((GEOMETRY.span, 16, 16))
     theta = TemporalBasis(GEOMETRY.span, 32, DOUBLE).analyze(merge_video(scene(), 3, 1) + noise)
     found, videos = find_patterns(theta), []
     assert found is not None
+    if kind is BesideMotion:
+        found = replace(found, motion=0.1 * theta[:12])
     for where in (DOUBLE, STRICT):
         problem = build_problem(segment, 3, 1, hold_out=0.02, arrays=where)
         cosines = TemporalBasis(GEOMETRY.span, 32, where)
-        refinement = Refinement(segment, problem, cosines, found, (3, 1))
+        refinement = kind(segment, problem, cosines, found, (3, 1))
         for _ in range(2 * ROUND):
             refinement.step()
         videos.append(refinement.video())

@@ -1,0 +1,163 @@
+"""Lamps beside something that moves: patterns with curves in pixels, and a volume in voxels, in one solver.
+
+    X(r, c, t) = Σ_k u_k(t)·Z_k(r, c) + V(r, c, t)
+
+Whatever moves needs a pattern for each of its places, so that such a scene is no sum of a few; and a volume
+does not hold lamps, because light that blinks costs its total variation twice its contrast in every period.
+Solved together, each part takes what it explains at the lower cost. The still ground belongs to the patterns,
+which are finer. Which is which shows in the fast cosines of the first look, which only lamps reach.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from acquire.arrays import host
+from acquire.recon.admm import Admm
+from acquire.recon.band import band_operator
+from acquire.recon.bandwidth import FEWEST_COEFFICIENTS
+from acquire.recon.basis import TemporalBasis
+from acquire.recon.joined import JoinedOperator, JoinedPrior, JoinedSign, Layout
+from acquire.recon.patterns import GAP, PARAMETERS, Patterns, Refinement
+from acquire.recon.sign import SignSplit
+from acquire.recon.tv import FrameTv
+from acquire.recon.volume import VolumeTv
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from acquire.arrays import Array
+    from acquire.lines import Segment
+    from acquire.recon.admm import AdmmParameters
+    from acquire.recon.basis import Basis, LearnedBasis
+    from acquire.recon.problem import MaskedOperator, Operator, Problem
+
+MOST_LAMPS, MOST_SLOW = 8, 3
+"""Largest number of fast patterns, and of slow ones besides the ground."""
+PACE, VOLUME_WEIGHT = 3.0, 0.3
+"""μ of the volume, and its λ/ρ relative to the patterns'."""
+WEIGHT = 0.5
+"""λ and ρ relative to those of patterns alone. λ is held from the start: what moves is lost in the patterns'
+errors if these are smoothed first."""
+
+
+def find_lamps(theta: NDArray[Any], basis: Basis) -> list[Patterns]:
+    """Lamps and still ground of a look's coefficients (K, n′, n′), and what moves; empty without fast lamps.
+
+    The patterns are those of the fast cosines, which hold nothing that moves, and the mean. Lamps that are
+    slow as well are the strongest patterns of the rest: each further result has one more of these.
+    """
+    count, side, _ = theta.shape
+    fast = basis.held >= FEWEST_COEFFICIENTS
+    flat = theta.reshape(count, -1).astype(np.float64)
+    lamps, strength = _principal(flat[fast])
+    gaps = np.flatnonzero(strength[:-1][:MOST_LAMPS] > GAP * strength[1:][:MOST_LAMPS]) + 1
+    if not len(gaps):
+        return []
+    space = np.linalg.qr(np.concatenate([lamps[: gaps[-1]], flat[:1]]).T)[0].T
+    others = _principal(flat - flat @ space.T @ space)[0][:MOST_SLOW]
+    found = []
+    for more in range(len(others) + 1):
+        images = np.concatenate([space, others[:more]])
+        mixed = flat @ images.T
+        curves, sizes, turn = np.linalg.svd(mixed, full_matrices=False)
+        patterns = ((sizes[:, None] * turn) @ images).reshape(-1, side, side).astype(theta.dtype)
+        moving = (flat - mixed @ images)[~fast].reshape(-1, side, side).astype(theta.dtype)
+        found.append(Patterns(curves.astype(theta.dtype), patterns, moving))
+    return found
+
+
+def _principal(rows: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Right singular vectors of rows (K, n′²), strongest first, and their singular values."""
+    energy, left = np.linalg.eigh(rows @ rows.T)
+    strength = np.sqrt(np.maximum(energy[::-1], 0))
+    images = left.T[::-1] @ rows / np.maximum(strength, np.finfo(np.float64).tiny)[:, None]
+    return images, strength
+
+
+class BesideMotion(Refinement):
+    """A refinement of patterns and, in the same solver, of a volume; ``found.motion`` is its start."""
+
+    def __init__(
+        self,
+        segment: Segment,
+        problem: Problem,
+        cosines: TemporalBasis,
+        found: Patterns,
+        merges: tuple[int, int],
+        parameters: AdmmParameters = PARAMETERS,
+    ) -> None:
+        weight, penalty = WEIGHT * parameters.tv_weight, WEIGHT * parameters.tv_penalty
+        sign_penalty = WEIGHT * parameters.sign_penalty
+        parameters = replace(parameters, tv_weight=weight, tv_penalty=penalty, sign_penalty=sign_penalty)
+        super().__init__(segment, problem, cosines, found, merges, parameters)
+        self.loosens = False
+
+    def _solver(self, operator: MaskedOperator, basis: LearnedBasis, emphasis: NDArray[Any]) -> Admm:
+        arrays, start = self._problem.arrays, self._theta
+        parts = self._layout.parts(start)
+        bases: tuple[Basis, Basis] = (self._slow, basis)
+        first, second = (
+            SignSplit(Admm.grid_of(own, self.parameters), part, None)
+            for own, part in zip(bases, parts, strict=True)
+        )
+        denoisers = VolumeTv(PACE), FrameTv(self.parameters.tv_iterations, joint=True)
+        weights = VOLUME_WEIGHT, arrays.asarray(emphasis)
+        return Admm(
+            operator,
+            self._problem.used_samples,
+            self._layout.shape,
+            basis,
+            self.parameters,
+            start=start,
+            denoiser=JoinedPrior(self._layout, denoisers, weights),
+            sign=JoinedSign(self._layout, first, second),
+        )
+
+    @property
+    def _slow(self) -> TemporalBasis:
+        """The basis of the volume."""
+        motion = self.found.motion
+        assert motion is not None
+        return TemporalBasis(self._cosines.frames, motion.shape[0], self._problem.arrays)
+
+    @property
+    def _layout(self) -> Layout:
+        found = self.found
+        assert found.motion is not None
+        # a voxel's penalty is that of its pixels
+        return Layout(tuple(found.motion.shape), tuple(found.patterns.shape), float(self._spatial_merge))
+
+    @cached_property
+    def _volume_operator(self) -> Operator:
+        geometry, code, merges = (
+            self.segment.geometry,
+            self.segment.code,
+            (self._spatial_merge, self._temporal_merge),
+        )
+        return band_operator(geometry, code, self._slow, *merges, self.segment.alignment, self.segment.blur)
+
+    def _operators(self) -> tuple[MaskedOperator, LearnedBasis]:
+        _, basis = super()._operators()
+        self._operator = JoinedOperator(self._layout, self._volume_operator, self._operator)
+        return self._problem.masked(self._operator), basis
+
+    @property
+    def _theta(self) -> Array:
+        asarray = self._problem.arrays.asarray  # what a refinement begins with is on the host
+        return self._layout.joined(asarray(self.found.motion), asarray(self.found.patterns))
+
+    def _at(self, curves: NDArray[Any]) -> Patterns:
+        motion, patterns = self._layout.parts(self._admm.theta)
+        return Patterns(curves, patterns, motion)
+
+    def _known_lines(self) -> NDArray[Any]:
+        return host(self._volume_operator.forward(self.found.motion)) / self._problem.norm
+
+    def video(self) -> NDArray[Any]:
+        video: NDArray[Any] = super().video() + host(self._slow.synthesize(self.found.motion))
+        return video

@@ -1,0 +1,108 @@
+"""Two kinds of coefficients in one solver: patterns in pixels, and a volume in voxels beside them.
+
+    lines = B₁·θ₁ + B₂·θ₂        θ = (s·θ₁, θ₂) in one array, each part with a prior and a sign of its own
+
+The data step of `admm` is made in the space of the lines, where both parts meet in one residual. Solved in
+turns instead, each would first explain all lines by itself, and neither would give back what is the other's.
+The scale s sets the ratio of both parts' penalties: s² for each voxel of as many pixels.
+"""
+
+from __future__ import annotations
+
+import math
+from copy import copy
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from acquire.arrays import namespace
+
+if TYPE_CHECKING:
+    from acquire.arrays import Array
+    from acquire.recon.denoisers import Denoiser
+    from acquire.recon.problem import Operator
+    from acquire.recon.sign import SignSplit
+
+    Shape = tuple[int, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Layout:
+    """Where both parts are in one array of a single axis; ``scale`` multiplies the first part."""
+
+    first: Shape
+    second: Shape
+    scale: float
+
+    @property
+    def shape(self) -> Shape:
+        return (math.prod(self.first) + math.prod(self.second),)
+
+    def joined(self, first: Array, second: Array) -> Array:
+        xp = namespace(first)
+        return xp.concat([xp.reshape(self.scale * first, (-1,)), xp.reshape(second, (-1,))])
+
+    def parts(self, theta: Array) -> tuple[Array, Array]:
+        xp, size = namespace(theta), math.prod(self.first)
+        first, second = xp.reshape(theta[:size], self.first), xp.reshape(theta[size:], self.second)
+        return first / self.scale, second
+
+
+class JoinedOperator:
+    """B₁·θ₁ + B₂·θ₂ and its transpose."""
+
+    def __init__(self, layout: Layout, first: Operator, second: Operator) -> None:
+        self._layout, self._first, self._second = layout, first, second
+
+    def forward(self, theta: Array) -> Array:
+        first, second = self._layout.parts(theta)
+        return self._first.forward(first) + self._second.forward(second)
+
+    def adjoint(self, lines: Array) -> Array:
+        # θ₁ is stored s times too large
+        first = self._first.adjoint(lines) / self._layout.scale**2
+        return self._layout.joined(first, self._second.adjoint(lines))
+
+
+class JoinedSign:
+    """Neither part is negative: a `SignSplit` of each."""
+
+    def __init__(self, layout: Layout, first: SignSplit, second: SignSplit) -> None:
+        self._layout, self._first, self._second = layout, first, second
+
+    def advance(self, theta: Array) -> None:
+        for split, part in zip((self._first, self._second), self._layout.parts(theta), strict=True):
+            split.advance(part)
+
+    def pull(self) -> Array:
+        return self._layout.joined(self._first.pull(), self._second.pull())
+
+    def rescale(self, factor: float) -> None:
+        self._first.rescale(factor)
+        self._second.rescale(factor)
+
+    def rebase(self, grid: Array, shape: Shape) -> None:  # noqa: ARG002 (the split's; both shapes are known)
+        """Continue on another grid of the second part, whose basis changes."""
+        self._second.rebase(grid, self._layout.second)
+
+    def resume(self, other: JoinedSign) -> None:
+        self._first.resume(other._first)
+        self._second.resume(other._second)
+
+    def copied(self) -> JoinedSign:
+        other = copy(self)
+        other._first, other._second = self._first.copied(), self._second.copied()
+        return other
+
+
+class JoinedPrior:
+    """A denoiser of each part; ``weights`` multiply λ/ρ of θ₁ (one) and of θ₂ (one for each frame)."""
+
+    def __init__(
+        self, layout: Layout, denoisers: tuple[Denoiser, Denoiser], weights: tuple[float, Array]
+    ) -> None:
+        self._layout, self._denoisers, self._weights = layout, denoisers, weights
+
+    def prox(self, frames: Array, weight: float | Array) -> Array:
+        each = zip(self._denoisers, self._layout.parts(frames), self._weights, strict=True)
+        first, second = (denoiser.prox(part, weight * own) for denoiser, part, own in each)
+        return self._layout.joined(first, second)
