@@ -63,6 +63,13 @@ class AdmmParameters:
         """ρ of the data step, which has both splits."""
         return self.tv_penalty + self.sign_penalty
 
+    def times(self, factor: float) -> AdmmParameters:
+        """The same with λ and both ρ multiplied: thresholds stay as they are."""
+        weight, penalty, sign = self.tv_weight, self.tv_penalty, self.sign_penalty
+        return replace(
+            self, tv_weight=factor * weight, tv_penalty=factor * penalty, sign_penalty=factor * sign
+        )
+
 
 class Admm:
     """Holds the iterates; `step` is one iteration, `theta` the current estimate (K, n′, n′).

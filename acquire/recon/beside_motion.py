@@ -10,7 +10,6 @@ which are finer. Which is which shows in the fast cosines of the first look, whi
 
 from __future__ import annotations
 
-from dataclasses import replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
@@ -22,7 +21,7 @@ from acquire.recon.band import band_operator
 from acquire.recon.bandwidth import FEWEST_COEFFICIENTS
 from acquire.recon.basis import TemporalBasis
 from acquire.recon.joined import JoinedOperator, JoinedPrior, JoinedSign, Layout
-from acquire.recon.patterns import GAP, PARAMETERS, Patterns, Refinement
+from acquire.recon.patterns import GAP, Patterns, Refinement
 from acquire.recon.sign import SignSplit
 from acquire.recon.tv import FrameTv
 from acquire.recon.volume import VolumeTv
@@ -31,10 +30,8 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from acquire.arrays import Array
-    from acquire.lines import Segment
-    from acquire.recon.admm import AdmmParameters
     from acquire.recon.basis import Basis, LearnedBasis
-    from acquire.recon.problem import MaskedOperator, Operator, Problem
+    from acquire.recon.problem import MaskedOperator, Operator
 
 MOST_LAMPS, MOST_SLOW = 8, 3
 """Largest number of fast patterns, and of slow ones besides the ground."""
@@ -82,20 +79,8 @@ def _principal(rows: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[
 class BesideMotion(Refinement):
     """A refinement of patterns and, in the same solver, of a volume; ``found.motion`` is its start."""
 
-    def __init__(
-        self,
-        segment: Segment,
-        problem: Problem,
-        cosines: TemporalBasis,
-        found: Patterns,
-        merges: tuple[int, int],
-        parameters: AdmmParameters = PARAMETERS,
-    ) -> None:
-        weight, penalty = WEIGHT * parameters.tv_weight, WEIGHT * parameters.tv_penalty
-        sign_penalty = WEIGHT * parameters.sign_penalty
-        parameters = replace(parameters, tv_weight=weight, tv_penalty=penalty, sign_penalty=sign_penalty)
-        super().__init__(segment, problem, cosines, found, merges, parameters)
-        self.loosens = False
+    share = WEIGHT
+    loosens = False
 
     def _solver(self, operator: MaskedOperator, basis: LearnedBasis, emphasis: NDArray[Any]) -> Admm:
         arrays, start = self._problem.arrays, self._theta
@@ -134,12 +119,8 @@ class BesideMotion(Refinement):
 
     @cached_property
     def _volume_operator(self) -> Operator:
-        geometry, code, merges = (
-            self.segment.geometry,
-            self.segment.code,
-            (self._spatial_merge, self._temporal_merge),
-        )
-        return band_operator(geometry, code, self._slow, *merges, self.segment.alignment, self.segment.blur)
+        of, merges = self.segment, (self._spatial_merge, self._temporal_merge)
+        return band_operator(of.geometry, of.code, self._slow, *merges, of.alignment, of.blur)
 
     def _operators(self) -> tuple[MaskedOperator, LearnedBasis]:
         _, basis = super()._operators()

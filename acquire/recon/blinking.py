@@ -360,7 +360,9 @@ def _in_patterns(
         left = problem.prediction_error(refinement.predict())
         if rivals and left > min(error, explained) and has_time(clock):
             other = better_than(left, rivals, problem, clock)
-            refinement = refinement if other is None else settle(other, problem, clock)
+            if other is not None:
+                other = settle(other, problem, clock)
+                refinement = other if problem.prediction_error(other.predict()) < left else refinement
     # without held-out samples both are NaN
     if refinement is None or error < problem.prediction_error(refinement.predict()):
         return None
@@ -375,11 +377,11 @@ def _beside_motion(
     clock: IterationClock,
 ) -> Refinement | None:
     """Patterns beside something that moves, unless the ``usual`` ones soon predict to ``enough``."""
-    bound = np.inf
-    if usual is not None:
-        soon = early_error(usual(), problem, clock)
-        bound = CLEARLY * soon if soon > enough else 0.0
-    return better_than(bound, rivals, problem, clock)
+    soon = np.inf if usual is None else early_error(usual(), problem, clock)
+    if soon > enough:
+        return better_than(CLEARLY * soon, rivals, problem, clock)
+    clock.reset()
+    return None
 
 
 def _for_noise(segment: Segment, problem: Problem, first: InBand) -> AdmmParameters:

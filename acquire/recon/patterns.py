@@ -18,7 +18,7 @@ from __future__ import annotations
 
 from copy import copy
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
@@ -140,6 +140,11 @@ def _is_enough(rank: int, energy: NDArray[np.float64], rest: float) -> bool:
 class Refinement:
     """Refines patterns and curves in turn: `step` is an ADMM iteration; a round ends with the curves' fit."""
 
+    share: ClassVar[float] = 1.0
+    """Factor of λ and ρ."""
+    loosens: bool = True
+    """Whether λ is lowered from round to round."""
+
     def __init__(
         self,
         segment: Segment,
@@ -151,8 +156,8 @@ class Refinement:
     ) -> None:
         self.segment, self._problem, self._cosines = segment, problem, cosines
         self._spatial_merge, self._temporal_merge = merge, temporal_merge = merges
-        self.parameters, self._first, self._steps = parameters, parameters, 0
-        self.loosens = True
+        self.parameters = self._first = parameters.times(self.share)
+        self._steps = 0
         self._fit = CurveFit(segment, problem, cosines, temporal_merge, RIDGE, learns=True)
         n = segment.geometry.size
         # a voxel held over its pixels; the last may stand out of the picture
@@ -173,8 +178,7 @@ class Refinement:
     def _solver(self, operator: MaskedOperator, basis: LearnedBasis, emphasis: NDArray[Any]) -> Admm:
         """ADMM from what is found."""
         samples, start = self._problem.used_samples, self._theta
-        shape = tuple(start.shape)
-        return Admm(operator, samples, shape, basis, self.parameters, start=start, emphasis=emphasis)
+        return Admm(operator, samples, start.shape, basis, self.parameters, start=start, emphasis=emphasis)
 
     @property
     def _theta(self) -> Array:

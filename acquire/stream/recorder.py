@@ -113,8 +113,7 @@ class Recorder:
         self._notes = Notes()
         self._line_rate_hz = 0.0
         self._trouble: tuple[str, dict[str, Cause]] | None = None
-        self._owner = True
-        self._busy = False
+        self._owner, self._busy = True, False
         self._commit_s = 0.0
         self._waits = DiskWaits(counters)
         self._hold_ups = HoldUps()

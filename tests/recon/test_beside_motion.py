@@ -10,11 +10,12 @@ from acquire.codes import prbs
 from acquire.evaluate.metrics import psnr
 from acquire.forward import merge_video
 from acquire.geometry import Geometry
-from acquire.recon import blinking, reconstruct
+from acquire.recon import blinking, reconstruct, settling
 from acquire.recon.admm import Admm, AdmmParameters
 from acquire.recon.band import band_operator
 from acquire.recon.basis import LearnedBasis, TemporalBasis
 from acquire.recon.beside_motion import BesideMotion, find_lamps
+from acquire.recon.clock import IterationClock
 from acquire.recon.joined import JoinedOperator, JoinedPrior, JoinedSign, Layout
 from acquire.recon.patterns import ROUND
 from acquire.recon.problem import build_problem
@@ -160,6 +161,25 @@ def test_a_refinement_keeps_both_parts_when_it_returns_continues_and_drops_a_pat
     refinement.return_to(kept)
     np.testing.assert_allclose(refinement.video(), video, atol=1e-6)
     np.testing.assert_allclose(refinement.predict(), lines, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("errors", "bound", "chosen"),
+    [
+        ((5.0, 3.0, 2.9, 1.0), 9.0, 1),  # one that is hardly better ends the search
+        ((5.0, 3.0, 2.0, 1.0), 9.0, 3),
+        ((5.0, 3.0, 3.5), 4.0, 1),
+        ((5.0, 4.5), 4.0, None),
+        ((), 4.0, None),
+    ],
+)
+def test_the_number_of_patterns_rises_as_long_as_it_pays(
+    errors: tuple[float, ...], bound: float, chosen: int | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(settling, "early_error", lambda each, *_: errors[each])
+    rivals = [lambda each=each: each for each in range(len(errors))]
+    found = settling.better_than(bound, rivals, None, IterationClock(1))  # type: ignore[arg-type]
+    assert found == chosen
 
 
 @pytest.mark.parametrize("seed", [81, 82])
