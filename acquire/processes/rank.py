@@ -87,7 +87,3 @@ def stand_back(nice: int, oom_score: int) -> None:
         os.sched_setscheduler(0, os.SCHED_BATCH, os.sched_param(0))
     with contextlib.suppress(OSError):  # a kernel without it, or a service that may not
         Path("/proc/self/oom_score_adj").write_text(str(oom_score), encoding="ascii")
-    # Where sessions share the processors (sched(7), autogroup), niceness counts only within one.
-    if os.getsid(0) == os.getpid():
-        with contextlib.suppress(OSError):  # a kernel without it
-            Path("/proc/self/autogroup").write_text(str(os.nice(0)), encoding="ascii")

@@ -7,7 +7,6 @@ import platform
 import re
 import subprocess
 import sys
-from pathlib import Path
 
 import pytest
 
@@ -42,20 +41,3 @@ print(shown.read_text() if shown.exists() else "")
     if version < (6, 12) or "se.slice" not in rest:
         pytest.skip("Linux ignores the slice that a process asks for before 6.12, or does not show it here")
     assert int(rest[rest.index("se.slice") + 2]) == 100_000
-
-
-def test_a_session_that_stands_back_does_so_before_other_sessions_as_well() -> None:
-    program = """
-from acquire.processes.rank import EARLY, stand_back
-stand_back(7, EARLY)
-print(open("/proc/self/autogroup").read())
-"""
-    if not Path("/proc/self/autogroup").exists():
-        pytest.skip("a kernel without CONFIG_SCHED_AUTOGROUP: niceness counts among all processes anyway")
-    words = [sys.executable, "-c", program]
-    group = subprocess.check_output(words, text=True, start_new_session=True)
-    expected = min(19, os.getpriority(os.PRIO_PROCESS, 0) + 7)
-    assert group.split()[-2:] == ["nice", str(expected)]
-    before = Path("/proc/self/autogroup").read_text(encoding="ascii")
-    subprocess.run(words, check=True, stdout=subprocess.DEVNULL)
-    assert Path("/proc/self/autogroup").read_text(encoding="ascii") == before  # its own session only
