@@ -3,6 +3,9 @@
 A repeated entry, such as that of a connection that cannot be accepted, is written only a few times a minute;
 once the minute is over, another entry states how many were suppressed. Entries about recordings, of which
 each is another fact, are bounded less narrowly. The log can thus neither be forged nor fill the disk.
+
+A thread of its own writes the entries: a stopped terminal or a pager that nobody scrolls accepts no text, and
+the thread that drives the devices must not wait for that. Entries for which there is no room are counted.
 """
 
 from __future__ import annotations
@@ -10,7 +13,9 @@ from __future__ import annotations
 import json
 import logging
 import os
+import queue
 import sys
+import threading
 import time
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -33,6 +38,10 @@ MOST_KINDS = 256
 MOST_CHARACTERS = 4000
 """Upper limit on the length of an entry."""
 MOST_TRACEBACK_LINES = 60
+MOST_WAITING = 1000
+"""Entries that wait to be written."""
+FLUSH_S = 1.0
+"""Time for the waiting entries at the end of the process."""
 
 Kind = tuple[str, int, str]
 """Logger, level and message before its arguments are formatted."""
@@ -112,17 +121,66 @@ class Bounded(logging.Filter):
         return count.seen <= count.most
 
 
+class Aside(logging.Handler):
+    """Writes entries to a descriptor in a thread of its own, so that no other thread waits for its reader."""
+
+    def __init__(self, file: int) -> None:
+        super().__init__()
+        self._file = file
+        self._waiting: queue.SimpleQueue[str | threading.Event] = queue.SimpleQueue()
+        self._lost = 0
+        # A daemon thread: it may be blocked for as long as nothing reads the log.
+        threading.Thread(target=self._write, name="log", daemon=True).start()
+
+    def emit(self, record: logging.LogRecord) -> None:
+        if self._waiting.qsize() < MOST_WAITING:
+            self._waiting.put(self.format(record))
+        else:
+            self._lost += 1
+
+    def flush(self) -> None:
+        """Wait until the entries so far are written, for at most `FLUSH_S`."""
+        written = threading.Event()
+        self._waiting.put(written)
+        written.wait(FLUSH_S)
+
+    def _write(self) -> None:
+        failed = told = 0
+        while True:
+            entry = self._waiting.get()
+            if isinstance(entry, str) and not self._is_accepted(entry):
+                failed += 1
+            # Reported where the gap is: entries that still wait are older than those that were lost.
+            if (lost := self._lost + failed) > told and self._waiting.empty():
+                report = _entry(f"{lost - told} entries were not written: the log accepted no text then")
+                if self._is_accepted(self.format(report)):
+                    told = lost
+            if isinstance(entry, threading.Event):
+                entry.set()
+
+    def _is_accepted(self, entry: str) -> bool:
+        text = f"{entry}\n".encode(errors="backslashreplace")
+        try:
+            # Not sys.stderr: the interpreter could not end while a thread holds the lock of its buffer.
+            while text:
+                text = text[os.write(self._file, text) :]
+        except OSError:
+            return False
+        return True
+
+
 def write_log(level: int) -> None:
     """Log entries of at least ``level`` to stderr, from now on in this process.
 
     The entries are text for people, but JSON if stderr is systemd's journal, which stamps every entry itself.
     """
-    handler = logging.StreamHandler()
-    handler.setFormatter(JsonLine() if is_journal(sys.stderr.fileno()) else OneLine())
-
-    def report(text: str) -> None:
-        # `emit` bypasses the filter, which would otherwise count its own entries.
-        handler.emit(logging.LogRecord("acquire.daemon", logging.WARNING, __file__, 0, text, None, None))
-
-    handler.addFilter(Bounded(report))
+    stderr = sys.stderr.fileno()
+    handler = Aside(stderr)
+    handler.setFormatter(JsonLine() if is_journal(stderr) else OneLine())
+    # `emit` bypasses the filter, which would otherwise count its own entries.
+    handler.addFilter(Bounded(lambda text: handler.emit(_entry(text))))
     logging.basicConfig(level=level, handlers=[handler])
+
+
+def _entry(text: str) -> logging.LogRecord:
+    return logging.LogRecord("acquire.daemon", logging.WARNING, __file__, 0, text, None, None)

@@ -7,7 +7,7 @@ import logging
 import subprocess
 import sys
 
-from acquire.logs import EACH, FACTS, MOST_CHARACTERS, REPEATS, WINDOW_S, Bounded, OneLine
+from acquire.logs import EACH, FACTS, MOST_CHARACTERS, MOST_WAITING, REPEATS, WINDOW_S, Bounded, OneLine
 
 
 def record(text: str, *words: object, level: int = logging.INFO) -> logging.LogRecord:
@@ -82,3 +82,35 @@ def test_under_systemd_the_log_is_json() -> None:
     assert (first["level"], first["logger"], first["message"]) == ("info", "acquire.daemon", r"a new\nline")
     assert second["traceback"][-1].startswith("ZeroDivisionError")
     assert first["time"].endswith("+00:00")
+
+
+def test_a_log_that_nobody_reads_holds_up_nobody() -> None:
+    """A stopped terminal, or a pager that nobody scrolls, held up the thread that drove the devices."""
+    code = (
+        "import logging, sys\n"
+        "from acquire.logs import EACH, write_log\n"
+        "write_log(logging.INFO); log = logging.getLogger('acquire.daemon')\n"
+        "for i in range(4000): log.info('%d %s', i, 'x' * 1000, extra={'most': 10**6})\n"
+        "print('done', flush=True); input(); log.info('read again'); logging.shutdown(); log.info('last')\n"
+    )
+    process = subprocess.Popen(
+        [sys.executable, "-c", code],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    assert process.stdin
+    assert process.stdout
+    assert process.stderr
+    with process:
+        assert process.stdout.readline() == "done\n"  # nothing has read the log until now
+        process.stdin.write("\n")
+        process.stdin.close()
+        lines = process.stderr.read().splitlines()
+    assert process.returncode == 0
+    written = [line for line in lines if line.endswith("x")]
+    [told] = [line for line in lines if "entries were not written: the log accepted" in line]
+    assert MOST_WAITING <= len(written) < 4000
+    assert int(told.split(" WARNING ")[1].split()[0]) == 4000 - len(written)
+    assert any(line.endswith("read again") for line in lines)

@@ -89,8 +89,7 @@ def busy_threads() -> list[str]:
 
 def _not_for_ever() -> None:
     """Have the kernel end the process (SIGALRM) if it is still there after `LINGER_S`."""
-    # The log may take no text, since its terminal was stopped or its pager is not read: the thread that waits
-    # for that holds the log's lock, so that the last lines, too, would be waited for without limit.
+    # What remains to be done may wait without limit, too: a file is removed from a disk that does not answer.
     signal.setitimer(signal.ITIMER_REAL, LINGER_S)
 
 
