@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from acquire.cli.completion import rigs
-from acquire.cli.output import say
+from acquire.cli.output import note, say
 
 if TYPE_CHECKING:
     from acquire.config.web import WebConfig
@@ -132,6 +132,7 @@ def _of_daemon(socket: Path) -> WebConfig | None:
         with Client(socket) as daemon:
             settings = daemon.setup().config["web"]
     except NoDaemonError:
+        note(f"no daemon listens on {socket}: this link leads nowhere until a page is served at its address")
         return None
     # As JSON, for the strict models.
     return None if settings is None else WebConfig.model_validate_json(json.dumps(settings))

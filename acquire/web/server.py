@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import logging
+import signal
 import socket as sockets
 import ssl
 from typing import TYPE_CHECKING
@@ -19,6 +20,7 @@ from acquire.web.app import build_page
 from acquire.web.tokens import TokenFile, load_tokens
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
     from pathlib import Path
 
     from acquire.config.web import WebConfig
@@ -81,7 +83,19 @@ async def _serve(
     settings.load()
     # After `load`, which would replace it: the context here has its own errors and least version.
     settings.ssl = context
-    await uvicorn.Server(settings).serve(sockets=[listener])
+    await PageServer(settings).serve(sockets=[listener])
+
+
+class PageServer(uvicorn.Server):
+    """Ends in order at SIGINT and SIGTERM, as documented: a success, not a death by that signal."""
+
+    @contextlib.contextmanager
+    def capture_signals(self) -> Iterator[None]:
+        """Handle signals as uvicorn does, but do not send them to this process again at the end."""
+        loop = asyncio.get_running_loop()
+        for number in (signal.SIGINT, signal.SIGTERM):
+            loop.add_signal_handler(number, self.handle_exit, number, None)
+        yield
 
 
 class BoundedConnection(Connection):

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import contextlib
+import signal
 import socket
 from pathlib import Path
 from urllib.parse import urlsplit
 
+import httpx
 import pytest
 from live_daemon import Daemon
 from page_server import PageServer
@@ -35,6 +37,16 @@ def test_pending_requests_do_not_fail_when_the_page_ends(tmp_path: Path, reads: 
     assert "timeout graceful shutdown" not in log
 
 
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+def test_a_page_that_is_told_to_end_has_succeeded(tmp_path: Path, number: int) -> None:
+    """systemd, and any script, took the death by a signal for a failure."""
+    server = PageServer(tmp_path / "c.sock", tmp_path)
+    assert httpx.get(server.address).status_code == 200  # until then the signals are not its own
+    server.process.send_signal(number)
+    assert server.process.wait(60) == 0
+    server.close()
+
+
 def test_the_link_leads_to_the_page_that_the_daemon_has_started(tmp_path: Path) -> None:
     with socket.create_server(("127.0.0.1", 0)) as free:
         port = free.getsockname()[1]
@@ -46,5 +58,6 @@ def test_the_link_leads_to_the_page_that_the_daemon_has_started(tmp_path: Path) 
         unknown = daemon("web", "--link", "--port", 0)
         assert unknown.code == 2
         assert "the page listens on any free port (web.port = 0)" in unknown.err
-    # without a daemon, as before
-    assert daemon("web", "--link").out.startswith("http://127.0.0.1:8300/#token=")
+    nowhere = daemon("web", "--link")
+    assert nowhere.out.startswith("http://127.0.0.1:8300/#token=")
+    assert "no daemon listens on" in nowhere.err
