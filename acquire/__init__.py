@@ -13,19 +13,21 @@ The layers, top to bottom; imports point downwards only (checked by the tests)::
     client                           the service from a script, blocking or awaited
     daemon        evaluate           the capture service · metrics, report
     rig           reconstruct        config -> devices · recording -> video
-    capacity      exchange           the loss-free rate of this host · files of other programs
+    simulate      capacity           scene -> recording · the loss-free rate of this host
+    exchange                         files of other programs
     calibrate                        measured properties of an instrument
     sim           recon              simulated devices · solvers, priors
     stream        forward            capture path · Eq. (1)-(4) of the paper and their adjoints
-    store  camera  trigger           recording format · device protocols
+    store  camera trigger            recording format · device protocols
     pattern                          test lines determined by their numbers alone
-    config  lines  processes         configuration · lines from camera to disk · child processes
+    config lines  processes          configuration · lines from camera to disk · child processes
     fibre                            position of a larger scene's bands on the sensors
     codes  geometry  clock  flags    the code, the shear, the time: plain arithmetic · flags of lines
-    arrays  cores                    array back ends, and the cores they may use
-    plugins                          classes that entry points name, ours and others'
-    logs  reading  showing           one line per entry · safe reading of foreign files · reprs
-    errors  text                     errors shown to the user, with exit codes · foreign text
+    alignment  blur                  position and sharpness of the arms' images
+    converter  noise                 a camera's non-linearity and noise
+    arrays cores  reading            array back ends · cores they may use · safe reading of foreign files
+    logs   plugins  showing          one line per entry · classes that entry points name · reprs
+    errors text   lazy   place       errors with exit codes · foreign text · late imports · fixed paths
 
 `GLOSSARY.md`, next to this file, defines the terms; `DECISIONS.md` gives the reasons for the design and the
 alternatives that were considered.

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 
 
 class Run:
-    """One run of a rig: armed once, records at most once, closed once."""
+    """One run of a rig: armed once, any number of recordings, closed once."""
 
     def __init__(
         self, config: RigConfig, rig: Rig, choose: Callable[[RigConfig], CodecChoice] = choose_for

@@ -1,4 +1,4 @@
-"""Two kinds of coefficients in one solver: patterns in pixels, and a volume in voxels beside them.
+"""Two kinds of coefficients in one solver: a volume in voxels (θ₁), and patterns in pixels (θ₂).
 
     lines = B₁·θ₁ + B₂·θ₂        θ = (s·θ₁, θ₂) in one array, each part with a prior and a sign of its own
 

@@ -79,7 +79,7 @@ def recall(path: Path | None = None) -> list[Learned]:
         return []
 
 
-def choose(known: Sequence[Learned], budget_s: float, voxels: int, workers: int = 1) -> Choice:
+def choose(known: Sequence[Learned], budget_s: float, voxels: int) -> Choice:
     """Choose the best preset on average, among those that end within ``budget_s`` for ``voxels`` voxels.
 
     ``known`` is of one solver. Times are scaled from the nearest size. Presets are compared on the scenes
@@ -99,8 +99,9 @@ def choose(known: Sequence[Learned], budget_s: float, voxels: int, workers: int 
         return Choice(
             None, f"presets were tried on {tried} ({names}), and {FEWEST_SCENES} are needed to prefer one"
         )
-    # time grows with the voxels; sub-segments are solved side by side
-    scale = voxels / nearest / max(1, workers)
+    # time grows with the voxels; parts that are solved side by side end sooner, but the limit must hold
+    # on cores that others use, too
+    scale = voxels / nearest
     in_time = {
         preset: fmean(tried[scene].psnr_db for scene in scenes)
         for preset, tried in by_preset.items()

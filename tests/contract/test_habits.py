@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import subprocess
 import sys
+import tomllib
 from collections import Counter
 from pathlib import Path
 
@@ -28,6 +29,19 @@ def test_rule(rule: str) -> None:
         [sys.executable, *TOOLS[rule]], cwd=ROOT, capture_output=True, text=True, timeout=800, check=False
     )
     assert done.returncode == 0, done.stdout + done.stderr
+
+
+def test_the_drawing_of_the_layers_is_the_contract() -> None:
+    """The drawing lacked a dozen modules, and had others on floors where they are not checked to be."""
+    document = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
+    layers = document["tool"]["importlinter"]["contracts"][0]["layers"]
+    floor = {name: number for number, names in enumerate(layers) for name in re.findall(r"\w+", names)}
+    drawing = (acquire.__doc__ or "").partition("(checked by the tests)::")[2].partition("`GLOSSARY.md`")[0]
+    drawn: list[str] = []
+    for row in drawing.strip().splitlines():
+        drawn += row.strip()[:33].split()
+    assert sorted(drawn) == sorted(floor)
+    assert [floor[name] for name in drawn] == sorted(floor.values())
 
 
 def test_modules_of_tests_have_names_of_their_own() -> None:
