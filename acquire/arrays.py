@@ -97,7 +97,9 @@ def _cupy() -> tuple[Any, Any]:
         return xp, cupy.cuda.Device()  # the current device; queries the driver
     except cupy.cuda.runtime.CUDARuntimeError as error:
         raise UsageError(
-            f"device 'gpu' does not work: {error}", possible="cpu", hint="nvidia-smi shows what CUDA sees"
+            f"device 'gpu' does not work: {error}",
+            possible="cpu",
+            hint="nvidia-smi, which lists the GPUs that the driver finds",
         ) from error
 
 

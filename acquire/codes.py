@@ -173,7 +173,7 @@ class ListedCode:
         given = np.asarray(bits)
         if given.ndim != 1 or given.dtype.kind not in "biu" or (given > 1).any() or (given < 0).any():
             raise UsageError(
-                f"an array of shape {given.shape} and dtype {given.dtype} is no list of code bits",
+                f"an array of shape {given.shape} and dtype {given.dtype} is not a list of code bits",
                 possible="(bit,) of 0 and 1, as integers",
             )
         return cls(np.packbits(given).tobytes().hex(), len(given), repeats)

@@ -33,7 +33,7 @@ class Noise:
     def __post_init__(self) -> None:
         numbers = np.array([*self.dn_per_electron, *self.dark_noise_dn])
         if not (np.isfinite(numbers).all() and (numbers >= 0).all()):
-            raise UsageError(f"the noise is impossible: {self}", possible="numbers from 0 on")
+            raise UsageError(f"the noise is impossible: {self}", possible="finite numbers, 0 or more")
 
     def variance_dn2(self, light_dn: NDArray[Any]) -> NDArray[np.float64]:
         """Return the variance of samples (arm, line, pixel) that are ``light_dn`` above their black level."""

@@ -33,9 +33,9 @@ OF_CODES: dict[str, tuple[Callable[[], Any], str]] = {
     "listed": (lambda: LISTED.bits(0, -1), "length = -1; possible"),
     "start": (lambda: PRBS.bits(0.5, 3), r"start = 0\.5 and length = 3; possible"),  # type: ignore[arg-type]
     "index": (lambda: state_at(16, 1, -1), "start = -1 .*start and length 0 or more"),
-    "two": (lambda: ListedCode.of(np.array([1, 2])), "no list of code bits; possible: .* 0 and 1"),
-    "float": (lambda: ListedCode.of(np.array([0.0, 1.0])), "dtype float64 is no list of code bits"),
-    "square": (lambda: ListedCode.of(np.eye(3, dtype=int)), r"shape \(3, 3\) and dtype int64 is no list"),
+    "two": (lambda: ListedCode.of(np.array([1, 2])), "not a list of code bits; possible: .* 0 and 1"),
+    "float": (lambda: ListedCode.of(np.array([0.0, 1.0])), "dtype float64 is not a list of code bits"),
+    "square": (lambda: ListedCode.of(np.eye(3, dtype=int)), r"shape \(3, 3\) and dtype int64 is not a list"),
     "no degree": (lambda: code_from_attrs({"kind": "prbs"}), "describes no code: KeyError: 'degree'; poss"),
     "no value": (lambda: code_from_attrs({"kind": "constant"}), "describes no code: KeyError"),
     "no bits": (lambda: code_from_attrs({"kind": "bits"}), "describes no code: KeyError"),

@@ -119,7 +119,7 @@ class Recorder(Device, Stageable, Preparable, Flyable, Collectable, WritesStream
         """Set the request of `kickoff`; without it, the recording lasts until `complete` stops it."""
         if not isinstance(value, StartRequest):
             raise UsageError(
-                f"{self.name}: cannot prepare with {value!r}", possible="StartRequest(duration_s=1.0)"
+                f"{self.name} cannot be prepared with {value!r}", possible="StartRequest(duration_s=1.0)"
             )
         self._request = value
 

@@ -85,7 +85,7 @@ def calibrated(segment: Segment, calibration: Calibration) -> Segment:
         raise UsageError(
             f"a calibration of {calibration.instrument.stages} columns does not fit lines of "
             f"{segment.geometry.stages} pixels",
-            possible="the same",
+            possible=f"lines of {calibration.instrument.stages} pixels",
         )
     calibration = _of_columns(calibration, segment)
     black, curve = black_level(segment, calibration), curve_of(calibration)

@@ -69,7 +69,7 @@ def refuse_level(exposure: Exposure, found: Moments, light: NDArray[np.float64])
         )
     if np.median(light, axis=1).min() < LOWEST_LIGHT_DN:
         raise UsageError(
-            f"{exposure.recording}: the light adds {np.median(light, axis=1).min():.2g} DN to an arm",
+            f"{exposure.recording}: the light adds only {np.median(light, axis=1).min():.2g} DN to an arm",
             possible=f"{LOWEST_LIGHT_DN:g} DN or more; 50 to 70 % of white are best",
             hint="check that the light is on and the scene white",
         )

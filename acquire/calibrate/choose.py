@@ -110,7 +110,7 @@ def carried_calibration(config: RigConfig, layout: str) -> Carried:
         ) from error
     if differences := differences_between(known.instrument, configured(config, layout)):
         raise ConfigError(
-            f"calibration: {place} is not of rig {config.name}: " + "; ".join(differences),
+            f"calibration: {place} is not one of rig {config.name}: " + "; ".join(differences),
             hint="acquire arm --without-calibration, and acquire calibrate all with another --out",
         )
     text = f"{place}: {', '.join(known.steps)}"

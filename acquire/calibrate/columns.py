@@ -215,7 +215,7 @@ def edge_doubt(
 ) -> NDArray[np.float64]:
     """Return for each arm the part of the light that its outermost columns may lack without being dark.
 
-    The spread of the columns' own gains hides it: what they lack together, all or those of the arm, is an
+    The spread of the columns' own gains hides it: their common deficit, of all or of those of the arm, is an
     estimate of it as uncertain as the mean of so many gains.
     """
     outermost = np.zeros_like(usable)

@@ -89,7 +89,7 @@ def beyond(exposure: Exposure) -> tuple[Beyond, Beyond]:
     code = code_from_attrs(exposure.recording.attrs["code"])
     if isinstance(code, ConstantCode):
         raise UsageError(
-            f"{exposure.recording} has steady light, which is never late",
+            f"{exposure.recording} has steady light, which cannot show a delay",
             possible="a pseudo-random code",
             hint="a run with the rig's code",
         )

@@ -207,8 +207,8 @@ def _crossing(points: Sequence[Point], arm: int, substep_ticks: int) -> Crossing
     later, seen = later[kept], [point.seen[arm] for point, good in zip(points, kept, strict=True) if good]
     if len(set(later)) < 2:
         raise UsageError(
-            f"arm {ARMS[arm]}: no two recordings have their light late, or early, by a part of a sub-step",
-            hint="let acquire calibrate delay, with the daemon, make the sweep",
+            f"arm {ARMS[arm]}: in no two recordings is the light late, or early, by a fraction of a sub-step",
+            hint="record the sweep with acquire calibrate delay, while the daemon runs",
         )
     model = _Model(later, seen, sight, substep_ticks)
     sharp = model.fit(rounded=False)

@@ -34,7 +34,7 @@ PARABOLA = 2
 CHANCE = 1e-3
 """Probability of taking the columns' own differences for a parabola."""
 BALANCE_ERROR = 5e-4
-"""Uncertainty of the balance from some hundredths of a pixel in the alignment."""
+"""Uncertainty of the balance from a few hundredths of a pixel in the alignment."""
 
 
 def profile(alignment: Alignment, stages: int, substeps: int) -> NDArray[np.float64]:

@@ -229,7 +229,7 @@ def _ramps(
         if len(kept) < FEWEST_LEVELS:
             raise UsageError(
                 f"arm {arm} has {len(kept)} levels of light that are neither dark nor saturated",
-                possible=f"{FEWEST_LEVELS} or more, each with the light on for another part of a sub-step",
+                possible=f"{FEWEST_LEVELS} or more, with the light on for different parts of a sub-step",
                 hint="acquire calibrate linearity records them; light the scene to 60 to 95 % of white",
             )
         columns = [np.array(each) for each in zip(*kept, strict=True)]

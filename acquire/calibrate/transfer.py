@@ -79,7 +79,7 @@ def transfer(
             )
     slopes = [_slope(sorted(points[arm], key=lambda point: point.light), arm) for arm in ARMS]
     K, error, full_dn = (np.array(each) for each in zip(*slopes, strict=True))
-    # Rounding to whole DN also scatters the samples, but is no noise of the pixels.
+    # Rounding to whole DN also scatters the samples, but is not noise of the pixels.
     read = np.sqrt(np.maximum((dark_noise**2).mean(axis=1) - QUANTISATION_DN2, 0)) / K
     read_error = read * np.hypot(error / K, 1 / np.sqrt(2.0 * dark_lines * offset.shape[1]))
     quantities = {"dn_per_electron": Measured(K, error), "read_noise_e": Measured(read, read_error)}
@@ -111,7 +111,7 @@ def _slope(points: list[Point], arm: str) -> tuple[float, float, float]:
             kept.append(point)
     if not kept:
         raise UsageError(
-            f"arm {arm} has no level between {LOWEST_LIGHT_DN:g} DN and where pixels are full",
+            f"arm {arm} has no level of light above {LOWEST_LIGHT_DN:g} DN at which pixels are not full",
             hint="record flats at 10 to 90 % of white",
         )
     # the error of variance/light is error/light

@@ -138,8 +138,8 @@ class FrameCount:
             # A few are late or were sent twice; after a restart all frames stay behind.
             if self._stale > _MOST_STALE:
                 raise CameraLostError(
-                    f"the camera has restarted its count: after id {self._last_id} came {self._stale} frames "
-                    f"with ids behind it, the last one {frame.frame_id}"
+                    f"the camera has restarted its count: after id {self._last_id}, {self._stale} frames "
+                    f"with lower ids came, the last one {frame.frame_id}"
                 )
             return None
         self._stale = 0
@@ -166,8 +166,8 @@ class FrameCount:
             return unnumbered
         if number < self._first_id:
             raise CameraError(
-                f"the first frame has id {number}, and ids begin at {self._first_id}",
-                hint="frame_id_first in the camera's table",
+                f"the first frame has id {number}, but ids are set to begin at {self._first_id}",
+                hint="change frame_id_first in the camera's table",
             )
         return number - self._first_id
 
@@ -227,7 +227,7 @@ class FrameCount:
         return missed
 
     def _explain(self, frame: FrameFacts, lost: int, missed: int, incomplete: int) -> Iterator[CameraLoss]:
-        # First what somebody has counted; only the rest of the hole is put down to the link.
+        # First the losses that were counted; only the rest of the hole is attributed to the link.
         if missed:
             yield CameraLoss(LossCause.MISSED_TRIGGER, missed)
         if incomplete:

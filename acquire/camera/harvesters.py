@@ -290,11 +290,12 @@ class _Library:
             raise CameraError(
                 f"there is no camera with serial number {serial!r}",
                 possible=there or "no camera answers",
-                hint=self._words.last or "cable, power, and acquire devices",
+                hint=self._words.last or "check cable and power, then acquire devices",
             )
         if model and chosen.model != model:
             raise CameraError(
-                f"camera {serial} is a {chosen.model!r}, not a {model!r}", hint="are the cameras swapped?"
+                f"camera {serial} is a {chosen.model!r}, not a {model!r}",
+                hint="check whether the cameras are swapped",
             )
         if chosen.access != "free":
             raise CameraError(f"camera {serial} is {chosen.access}", hint="end the program that holds it")

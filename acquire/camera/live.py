@@ -64,7 +64,7 @@ class LiveCamera:
             return message.of
         # Last: a process that has died may have sent readings, or its error, before.
         if self._worker.death is not None:
-            raise CameraError(f"{self._worker.name}: its process is gone: {self._worker.death}")
+            raise CameraError(f"{self._worker.name}: its process has ended: {self._worker.death}")
         return {}
 
     def close(self) -> None:
@@ -106,6 +106,6 @@ def _white(view: View, settings: dict[str, Any]) -> int:
         raise CameraError(
             f"the camera's PixelFormat is {pixel_format!r}, for which the white level is unknown",
             possible=", ".join(PIXEL_BITS),
-            hint="a rig file, which states it",
+            hint="use a rig file (--config), which states it",
         )
     return (1 << bits) - 1

@@ -88,8 +88,8 @@ def snapshot(
     while end < lines:
         if time.monotonic() > deadline:
             raise CameraError(
-                f"{end} of {lines} lines came in {timeout_s:g} s",
-                hint="line triggers, or TriggerMode Off; acquire camera features",
+                f"only {end} of {lines} lines came in {timeout_s:g} s",
+                hint="check the line triggers, or set TriggerMode to Off (acquire camera features)",
             )
         block = camera.next_block(_WAIT_S)
         if block is None:

@@ -27,6 +27,6 @@ def find_producers(cti: str = "") -> list[Path]:
         raise CameraError(
             "there is no GenTL producer",
             possible=f".cti files in the directories of {PATH}, which the maker of a frame grabber installs",
-            hint=f"cti in the camera's table, or {PATH} in the environment",
+            hint=f"set cti in the camera's table, or {PATH} in the environment",
         )
     return found

@@ -56,7 +56,7 @@ def await_done(command: str, is_done: Callable[[], bool]) -> None:
             raise CameraError(
                 f"{command} is not done after {COMMAND_S:g} s",
                 possible="the camera may still be carrying it out",
-                hint="the camera's manual says when it takes the command",
+                hint="look up in the camera's manual when it accepts the command",
             )
         time.sleep(0.001)
 
@@ -115,7 +115,7 @@ def apply_settings(settings: Iterable[Setting], modules: Mapping[str, Features])
             now = f", it reads {node.read()!r}" if node.readable else ""
             raise CameraError(
                 f"{setting}: it cannot be written now{now}",
-                hint="first a setting that makes it writable (a selector or mode), unless it is read-only",
+                hint="first write a setting that unlocks it (a selector or mode), unless it is read-only",
             )
         node.write(value)
         if node.kind != "command":

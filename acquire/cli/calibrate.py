@@ -38,7 +38,7 @@ OutOption = Annotated[
 ]
 CoveredOption = Annotated[
     bool,
-    typer.Option("--covered", help="The lens was covered during the recording, so that any code will do."),
+    typer.Option("--covered", help="The lens was covered during the recording, so that any code is valid."),
 ]
 CHANGED = 1
 """Exit code of a check that finds the calibration out of date."""
@@ -69,9 +69,9 @@ def dark(
 ) -> None:
     """Measure the offset and noise of every column, from lines recorded without the light.
 
-    Record with the lens as in use and the light's code 0 (code.kind = "constant", code.value = 0); the offset
-    then includes the ambient light. Or cover the lens and give --covered. 1024 lines give offsets to 0.1 DN.
-    The black level must be above 0 by a few times the noise.
+    Record with the lens as in use and the exposure code 0 (code.kind = "constant", code.value = 0); the
+    offset then includes the ambient light. Or cover the lens and give --covered. 1024 lines give offsets to
+    0.1 DN. The black level must be above 0 by a few times the noise.
 
     Example: [bold]acquire calibrate dark dark.zarr --out cal.zarr[/]
     """
@@ -92,7 +92,7 @@ def ambient(
     end: ToOption = None,
     json: JsonFlag = False,
 ) -> None:
-    """Measure the ambient light, from lines recorded with the lens open and the light's code 0.
+    """Measure the ambient light, from lines recorded with the lens open and the exposure code 0.
 
     This step needs a dark that was recorded with --covered, since other darks already include the ambient
     light. 1024 lines are enough.
@@ -125,8 +125,8 @@ def flat(
 ) -> None:
     """Measure the gain of every column and the balance of the arms, from a white scene in steady light.
 
-    Place a uniform white scene, larger than the field, before the lens, and record with the light's code 1 at
-    50 to 70 % of white. 1024 lines give gains to 0.05 %. The dark step must come first.
+    Place a uniform white scene, larger than the field, before the lens, and record with the exposure code 1
+    (code.value = 1) at 50 to 70 % of white. 1024 lines give gains to 0.05 %. The dark step must come first.
 
     Example: [bold]acquire calibrate flat flat.zarr --out cal.zarr[/]
     """
@@ -200,8 +200,8 @@ def align(
 
     Place a stationary target before the lens that fills the field with sharp texture, dots or bars of 2 to 6
     fine pixels, and record with the usual pseudo-random code. 1024 lines give 0.02 fine pixels; 263 are too
-    few. It is best done after dark and flat. Behind a fibre each tile is aligned separately, along its fibre
-    bands.
+    few. Align is best done after dark and flat. Behind a fibre each tile is aligned separately, along its
+    fibre bands.
 
     Example: [bold]acquire calibrate align target.zarr --out cal.zarr[/]
     """

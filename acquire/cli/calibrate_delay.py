@@ -53,9 +53,9 @@ def delay(
     """Measure the delay of the light for each camera, to one tick of the trigger.
 
     The result includes the keys for the rig file. The command sweeps the trigger's delays on the running
-    daemon: a first recording locates light and charge, six more follow around it. Ctrl-C ends the sweep early
-    and evaluates what there is. Afterwards the instrument is armed or idle as it was before. Noise limits the
-    result, so bright light just below saturation is best.
+    daemon: a first recording gives the rough delay, and six more follow around it. Ctrl-C ends the sweep
+    early and evaluates the recordings made so far. Afterwards the instrument is armed or idle as it was
+    before. Noise limits the result, so bright light just below saturation is best.
 
     Example: [bold]acquire calibrate delay --out cal.zarr[/]
     """

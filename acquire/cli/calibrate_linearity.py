@@ -46,8 +46,8 @@ def linearity(
     The command records a ramp on the running daemon: the light is on for 1/16 to 15/16 of every sub-step, in
     ticks of the trigger, so that the ratios are exact whatever the lamp. The ramp also gives DN per electron,
     read noise and full well. Reconstructions correct the curve. The dark step must come first, and the flat
-    comes afterwards. Ctrl-C ends the ramp early and evaluates what there is. Afterwards the instrument is
-    armed or idle as it was before.
+    comes afterwards. Ctrl-C ends the ramp early and evaluates the recordings made so far. Afterwards the
+    instrument is armed or idle as it was before.
 
     Example: [bold]acquire calibrate linearity --out cal.zarr[/]
     """

@@ -143,7 +143,9 @@ def wait_for_enter() -> None:
     """Wait for Enter. Raises StateError if standard input is closed."""
     note("press Enter to continue, or Ctrl-C to end; the results so far are saved")
     if not sys.stdin.readline():
-        raise StateError("nobody is there to press Enter", hint="--yes, if everything is in place")
+        raise StateError(
+            "Enter cannot be pressed: standard input is closed", hint="--yes, if everything is in place"
+        )
 
 
 def _settled(daemon: Client, calm_s: float) -> Status:

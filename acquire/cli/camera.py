@@ -44,7 +44,7 @@ def register(app: typer.Typer) -> None:
 def features(serial: SerialArgument, config: ConfigOption = None, json: JsonFlag = False) -> None:
     """Print every feature of a camera and of its driver: value, access and possible values.
 
-    With a rig file the camera's settings are written first.
+    With a rig file, its settings are written to the camera first.
 
     Example: [bold]acquire camera features SIM-A --config rig-demo[/]
     """

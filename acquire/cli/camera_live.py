@@ -42,7 +42,9 @@ def live(
     ] = None,
     code: Annotated[
         str | None,
-        typer.Option(help="Light, with --config: rig (follow the rig's code), dark (off) or steady (on)."),
+        typer.Option(
+            help="Light, with --config: rig (follow the rig's code), dark (off) or steady (on). Default: rig."
+        ),
     ] = None,
     seconds: Annotated[
         float | None,
@@ -59,7 +61,7 @@ def live(
 ) -> None:
     """Show level, saturation and focus of the cameras five times a second, until Ctrl-C.
 
-    If the daemon is armed or recording, the command reads its lines without taking any away. With --config it
+    If the daemon is armed or recording, the command reads its lines, without effect on them. With --config it
     opens the rig's cameras itself, runs the trigger, and closes both at the end. The focus number is the RMS
     difference of neighbouring pixels relative to the mean. To focus, use steady light and a target with
     detail, and turn the lens until the number is largest. With --json the command prints one object per line.

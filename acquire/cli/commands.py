@@ -39,7 +39,7 @@ COMMANDS = (
     Listed("info", "recordings", RECORDINGS, "show what a recording holds, and how it ended"),
     Listed("verify", "recordings", RECORDINGS, "read a whole recording and check every line"),
     Listed("recover", "recordings", RECORDINGS, "seal a recording whose writer was killed"),
-    Listed("hold", "recordings", RECORDINGS, "keep lines of an endless recording"),
+    Listed("hold", "recordings", RECORDINGS, "keep lines of an endless recording from being dropped"),
     Listed("upload", "recordings", RECORDINGS, "copy a recording to a remote store, even while it grows"),
     Listed("cut", "recordings", RECORDINGS, "write a range of lines of both arms to a NumPy file"),
     Listed("reconstruct", "reconstruct", RECORDINGS, "make a video of a range of lines, with any voxels"),

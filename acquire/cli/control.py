@@ -56,11 +56,11 @@ def arm(
 ) -> None:
     """Start the trigger and the cameras without recording.
 
-    The daemon first measures which line rate the ring, the codec and the disk sustain on this host. This
-    takes half a second and is valid for ten minutes. If the best of three measurements is below the
-    configured rate, arm is refused with exit code 2; with simulated cameras, which wait for a busy host, it
-    is only a warning. Arm is also refused if recordings are to be uploaded and the store denies access; a
-    store that cannot be reached is only a warning.
+    The daemon first measures the line rate that the ring, the codec and the disk sustain on this host. The
+    measurement takes half a second and is valid for ten minutes. If the best of three measurements is below
+    the configured rate, arm is refused with exit code 2; with simulated cameras, which wait for a busy host,
+    there is only a warning. Arm is also refused if recordings are to be uploaded and the store denies access;
+    if the store cannot be reached, there is only a warning.
 
     Example: [bold]acquire arm[/]
     """
@@ -79,17 +79,24 @@ def start(
             metavar="RECORDING", help="New recording NAME.zarr. Default: a name made of the rig and the time."
         ),
     ] = None,
-    lines: Annotated[int | None, typer.Option(help="End after this number of lines.")] = None,
+    lines: Annotated[
+        int | None, typer.Option(help="End after this number of lines. Default: at `acquire stop`.")
+    ] = None,
     duration: Annotated[
         float | None,
-        typer.Option(parser=seconds, metavar="TIME", help="End after this time, such as 5s, 500ms or 2min."),
+        typer.Option(
+            parser=seconds,
+            metavar="TIME",
+            help="End after this time, such as 5s, 500ms or 2min. Default: at `acquire stop`.",
+        ),
     ] = None,
     pre: Annotated[
         float | None,
         typer.Option(
             parser=seconds,
             metavar="TIME",
-            help="Begin this long before the command, with lines that are still in the ring buffers.",
+            help="Begin this long before the command, with lines that are still in the ring buffers. "
+            "Default: with the next line.",
         ),
     ] = None,
     post: Annotated[
@@ -97,7 +104,7 @@ def start(
         typer.Option(
             parser=seconds,
             metavar="TIME",
-            help="End this long after the command, regardless of --pre.",
+            help="End this long after the command, regardless of --pre. Default: at `acquire stop`.",
         ),
     ] = None,
     resume: Annotated[
@@ -125,8 +132,8 @@ def mark(
     socket: SocketOption = None,
     json: JsonFlag = False,
 ) -> None:
-    """Mark the current moment in the recording. While armed, a mark can start one, if the rig's events say
-    so.
+    """Mark the current moment in the recording. While armed, a mark can start one, if events.sources
+    in the rig file contains "mark".
 
     Example: [bold]acquire mark "the valve opens"[/]
     """
@@ -185,7 +192,8 @@ def status(
         str | None,
         typer.Option(
             metavar="STATE",
-            help="First wait for this state of the daemon, or for 'sealed': no recording in progress.",
+            help="First wait for this state of the daemon: idle, armed, recording, draining or faulted, or "
+            "for sealed (no recording in progress).",
             autocompletion=states,
         ),
     ] = None,
@@ -194,7 +202,7 @@ def status(
         typer.Option(
             parser=seconds,
             metavar="TIME",
-            help="Longest time to --wait for the state; then exit with code 4. Default: 60s.",
+            help="With --wait: time after which the command gives up, with exit code 4. Default: 60s.",
             show_default=False,
         ),
     ] = 60.0,
@@ -206,7 +214,7 @@ def status(
         typer.Option(
             parser=seconds,
             metavar="TIME",
-            help="Time between two updates of --watch. Default: 1s.",
+            help="With --watch: time between two updates. Default: 1s.",
             show_default=False,
         ),
     ] = 1.0,
@@ -221,7 +229,7 @@ def status(
     Example: [bold]acquire status --wait sealed --timeout 30s[/], or [bold]acquire status --watch[/]
     """
     if wait is not None:
-        # Not for every status: one without options is to come at once.
+        # Not for every status: one without options must appear at once.
         from acquire.daemon.states import SEALED, State
 
         waits = {SEALED_WORD: SEALED, **{str(state): frozenset({state}) for state in State}}

@@ -70,9 +70,9 @@ def export(
 ) -> None:
     """Write a video, or the lines of a recording, as a TIFF, HDF5 (NeXus), NumPy or MP4 file.
 
-    Of a video only the trusted frames are written, unless you request all of them. Every format except .npy
+    Only the trusted frames of a video are written, unless --all-frames is given. Every format except .npy
     records where the data comes from. The estimated error of a video's regions is included, except in .tif,
-    .npy and .mp4 files, which have no place for it.
+    .npy and .mp4 files, which cannot hold it.
 
     Example: [bold]acquire export video.zarr video.tif --from 2ms --to 5ms[/]
     """
@@ -89,7 +89,7 @@ def export(
     # Refused before the source is opened, which may be far away.
     format_for(out)
     check_new_path(out)
-    # None is no format of ours: `open_recording` then says what is there instead.
+    # None is not a format of ours: `open_recording` then reports what is there instead.
     if (format_of(source) or "").startswith("acquire-video/"):
         # 1, the default, averages nothing and is no mistake with a video.
         averaged = average if average > 1 else None
@@ -148,7 +148,8 @@ def _frames_between(
         return range(start, total if count is None else start + count)
     if first is not None or count is not None:
         raise UsageError(
-            "numbers and times exclude each other", possible="--first-frame and --frames, or --from and --to"
+            "numbers and times of frames exclude each other",
+            possible="--first-frame and --frames, or --from and --to",
         )
     # A video without frames is refused below, whatever the times.
     first_ns, interval_ns = int(video.time_ns[0]) if total else 0, video.interval_ns

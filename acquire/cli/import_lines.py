@@ -56,7 +56,7 @@ def import_lines(
         int | None,
         typer.Option(help="M, number of stages of the sensor, which is the number of pixels per line."),
     ] = None,
-    substeps: Annotated[int | None, typer.Option(help="S, number of charge-transfer steps per line.")] = None,
+    substeps: Annotated[int | None, typer.Option(help="S, number of sub-steps per line.")] = None,
     line_rate: Annotated[float | None, typer.Option(metavar="HZ", help="Number of lines per second.")] = None,
     code: Annotated[
         str | None,
@@ -68,7 +68,8 @@ def import_lines(
         int, typer.Option(min=0, help="Index of the code bit in the first sub-step of line 0.")
     ] = 0,
     code_repeats: Annotated[
-        bool, typer.Option("--code-repeats", help="The bits of a bits: code repeat after the last one.")
+        bool,
+        typer.Option("--code-repeats", help="Repeat the bits of a bits: code after the last one."),
     ] = False,
     first_line: Annotated[int, typer.Option(min=0, help="Number of the first line in the files.")] = 0,
     lines: Annotated[
@@ -104,29 +105,42 @@ def import_lines(
         str | None,
         typer.Option(
             metavar="FIRST:END",
-            help="Range of pixels in each line that belongs to arm b, possibly of the same file. Default: "
+            help="Range of pixels in each line that belongs to arm b, possibly in the same file. Default: "
             "all.",
         ),
     ] = None,
     white: Annotated[
-        float | None, typer.Option(metavar="DN", help="Value at which a pixel is saturated.")
+        float | None,
+        typer.Option(
+            metavar="DN",
+            help="Value at which a pixel is saturated. Default: the rig's, or the sample type's largest.",
+        ),
     ] = None,
-    black: Annotated[float | None, typer.Option(metavar="DN", help="Value of a pixel without light.")] = None,
+    black: Annotated[
+        float | None,
+        typer.Option(metavar="DN", help="Value of a pixel without light. Default: the rig's, or 0."),
+    ] = None,
     responsivity: Annotated[
-        float | None, typer.Option(metavar="DN", help="Responsivity in DN per unit of light and sub-step.")
+        float | None,
+        typer.Option(
+            metavar="DN",
+            help="Responsivity in DN per unit of light and sub-step. Default: the rig's, or 1.",
+        ),
     ] = None,
     start: Annotated[
         str | None,
         typer.Option(
-            metavar="UTC", help="UTC at which the first line was read out, such as 2026-01-31T12:00:00.25."
+            metavar="UTC",
+            help="UTC at which the first line was read out, such as 2026-01-31T12:00:00.25. Default: the "
+            "beginning of 1970.",
         ),
     ] = None,
     json: JsonFlag = False,
 ) -> None:
     """Make a recording from lines that other software captured, to verify, cut and reconstruct it.
 
-    Only your arguments tie these lines to the exposure code, so the recording states what is not known about
-    them.
+    Only the options that you give relate these lines to the exposure code, so the recording states what is
+    not known about the lines.
 
     Example: [bold]acquire import a.tif b.tif --out run.zarr --config rig.toml[/]
     """

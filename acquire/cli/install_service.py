@@ -42,7 +42,7 @@ def install_service(
     """Print or write a hardened systemd unit for the daemon and a udev rule.
 
     The daemon tells systemd when it is ready and answers its watchdog. If it is killed or hangs, systemd
-    restarts it; it then recovers an unfinished recording and does what [service] begin in the rig file says.
+    restarts it; it then recovers an unfinished recording and follows [service] begin in the rig file.
     This command starts nothing.
 
     Example: [bold]acquire install-service --config rig-demo --user[/]
@@ -70,7 +70,7 @@ def install_service(
         return
     # check all files before the first is written
     for path, text in files.items():
-        # A file of somebody else's may be no UTF-8, and differs then in any case.
+        # Another program's file may not be UTF-8, and then differs in any case.
         if path.exists() and path.read_text(encoding="utf-8", errors="replace") != text:
             raise UsageError(
                 f"{path} exists with different contents and is not overwritten",

@@ -100,7 +100,7 @@ def _handled_by(handler: signal._HANDLER) -> Iterator[None]:
     if threading.current_thread() is not threading.main_thread():
         yield  # only the main thread can install handlers; other callers stop the work in their own way
         return
-    # A script's background job is started with SIGINT ignored; the page stops such jobs by it all the same.
+    # A script's background job is started with SIGINT ignored; the page still stops such jobs by it.
     numbers = [signal.SIGINT, *(one for one in UNLESS_IGNORED if signal.getsignal(one) != signal.SIG_IGN)]
     before = {number: signal.signal(number, handler) for number in numbers}
     try:

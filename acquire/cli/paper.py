@@ -63,8 +63,8 @@ def paper(
     """Record, reconstruct and draw figures of the paper, and compare them with its statements.
 
     With --recording, Fig. 9 is made from a recording of your own, corrected by the calibration in it. The
-    scene must have four lamps in the quarters of the field, of 5, 2.5 and 1 kHz and constant; they are
-    identified by their light.
+    scene must have one lamp in each quarter of the field: three that blink at 5, 2.5 and 1 kHz, and one that
+    is constant. They are identified by their light.
 
     Example: [bold]acquire paper fig9[/]
     """

@@ -43,7 +43,11 @@ def register(app: typer.Typer) -> None:
 def reconstruct(
     recording: PlaceArgument,
     out: Annotated[
-        str | None, typer.Option(metavar="VIDEO", help="New video: a directory NAME.zarr, or a URL.")
+        str | None,
+        typer.Option(
+            metavar="VIDEO",
+            help="New video: a directory NAME.zarr, or a URL. Required without --auto or --explain.",
+        ),
     ] = None,
     first_line: FirstLineOption = None,
     lines: LinesOption = None,
@@ -78,15 +82,21 @@ def reconstruct(
         list[str] | None,
         typer.Option(
             metavar="LENGTH:NMxTM",
-            help="Add one sub-segment to a plan, by lines or time: 712:3x4, 1.1ms:1x230, or :3x4 for the "
-            "rest. Repeatable.",
+            help="Add a sub-segment to the plan, with its length in lines or time: 712:3x4, 1.1ms:1x230, or "
+            ":3x4 for the rest. Repeatable.",
         ),
     ] = None,
     auto: Annotated[
-        bool, typer.Option("--auto", help="Propose a plan based on the lines, and explain it.")
+        bool,
+        typer.Option(
+            "--auto", help="Propose a plan based on the lines and explain it; with --out, also carry it out."
+        ),
     ] = False,
     save_plan: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Write the plan to this new file.")
+        Path | None,
+        typer.Option(
+            metavar="FILE", help="With --auto, --plan or --segment: write the plan to this new file."
+        ),
     ] = None,
     ends: Annotated[
         str | None,
@@ -141,7 +151,11 @@ def reconstruct(
     ] = None,
     explain: Annotated[
         bool,
-        typer.Option("--explain", help="Only show what each part of the calibration gains and costs."),
+        typer.Option(
+            "--explain",
+            help="Show what each part of the calibration gains and costs; without --out or --auto, nothing "
+            "else is done.",
+        ),
     ] = False,
     try_orientations: Annotated[
         bool,
@@ -155,7 +169,7 @@ def reconstruct(
         str | None,
         typer.Option(
             help="Search for prior and weight: in each tile or sub-segment (each), or once for all (shared). "
-            "Default: shared among tiles."
+            "Default: shared for tiles, each for sub-segments."
         ),
     ] = None,
     preview: Annotated[
@@ -165,7 +179,8 @@ def reconstruct(
     dask: Annotated[
         str | None,
         typer.Option(
-            metavar="ADDRESS", help="Compute on the Dask cluster with this scheduler: tcp://HOST:8786."
+            metavar="ADDRESS",
+            help="Compute on the Dask cluster with this scheduler: tcp://HOST:8786. Default: this machine.",
         ),
     ] = None,
     json: JsonFlag = False,

@@ -265,7 +265,7 @@ def _plan(recording: Recording, selection: Selection, arguments: Arguments) -> R
             )
     if arguments.plan is not None:
         plan = load_plan(arguments.plan)
-        # --ends goes before what the file says.
+        # --ends overrides what the file says.
         return plan if arguments.ends is None else plan.model_copy(update={"ends": arguments.ends})
     if not arguments.segments:
         return None

@@ -164,17 +164,21 @@ def recover(recording: RecordingArgument, json: JsonFlag = False) -> None:
 def hold(
     recording: RecordingArgument,
     first_line: Annotated[
-        int | None, typer.Option(help="Number of the first line, as counted by the trigger.")
+        int | None,
+        typer.Option(help="Number of the first line, as counted by the trigger. Required without --from."),
     ] = None,
     lines: Annotated[
-        int | None, typer.Option(help="Number of lines. They may include lines that are not recorded yet.")
+        int | None,
+        typer.Option(
+            help="Number of lines, possibly including lines that are not recorded yet. Required without --to."
+        ),
     ] = None,
     begin: FromOption = None,
     end: ToOption = None,
-    why: Annotated[str, typer.Option(metavar="TEXT", help="Reason to store with the held lines.")] = "",
+    why: Annotated[str, typer.Option(metavar="TEXT", help="Reason, stored with the held lines.")] = "",
     json: JsonFlag = False,
 ) -> None:
-    """Keep lines of an endless recording from being dropped, with the lines around them for reconstruction.
+    """Keep lines of an endless recording, and the neighbours needed to reconstruct them, from being dropped.
 
     If some of the lines are gone already, the others are held and the exit code is 6.
 
@@ -247,7 +251,8 @@ def cut(
         int,
         typer.Option(
             min=1,
-            help="Sum this number of lines and columns, for a sensor without intra-line charge transfer.",
+            help="Sum blocks of this many lines by this many columns, for a sensor without intra-line charge "
+            "transfer. 1: no sums.",
         ),
     ] = 1,
     tile: TileOption = None,
@@ -256,7 +261,7 @@ def cut(
     """Write a range of lines of both arms to an npz file: lines, mask, code, time_ns, stages, substeps,
     scales.
 
-    --merge 3 turns 192 stages that were triggered at every sub-step into 64 stages with 3 intra-line steps.
+    --merge 3 turns 192 stages that were triggered at every sub-step into 64 stages with 3 sub-steps.
 
     Example: [bold]acquire cut run.zarr --first-line 2000 --lines 256 --out segment.npz[/], or
     [bold]acquire cut run.zarr --from 52ms --to 60ms --out segment.npz[/]

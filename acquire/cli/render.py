@@ -53,8 +53,8 @@ def render(
 ) -> None:
     """Turn reconstructed videos into a movie, an animation, a sheet of stills or a page.
 
-    A page has a player with single steps, the residual of every frame over time, and the facts of every
-    sub-segment.
+    A page has a player with single steps, the residual of every frame over time, and the parameters and
+    quality of every sub-segment.
 
     Example: [bold]acquire render fish-1x820.zarr fish-3x4.zarr --out fish.mp4[/]
     """

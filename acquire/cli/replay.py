@@ -49,7 +49,8 @@ def replay(
     socket: Annotated[
         Path | None,
         typer.Option(
-            envvar="ACQUIRE_SOCKET", help="Control socket, without --out. Default: the user's usual one."
+            envvar="ACQUIRE_SOCKET",
+            help="Without --out: control socket to listen on. Default: the user's usual one.",
         ),
     ] = None,
     json: JsonFlag = False,
@@ -58,8 +59,8 @@ def replay(
 
     With --out, a daemon makes one recording, on a socket of its own, and every array of it is compared with
     the original. The exit code is 0 if all are equal, 6 if one differs, and 2 if the recording cannot be
-    replayed. Gaps stay gaps, and flags are replayed as recorded; the exposure code is not checked again,
-    because the time of such a verdict depends on the load. If lines are lost because the recording does not
+    replayed. Gaps and flags are replayed as recorded; the exposure code is not checked again, because the
+    moment at which a check reports depends on the load. If lines are lost because the recording does not
     fit into memory, the replay is repeated at a lower speed.
 
     Without --out, the daemon runs until Ctrl-C and is armed and started like any other.

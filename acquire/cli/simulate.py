@@ -32,7 +32,8 @@ def simulate(
         ),
     ],
     out: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="New recording NAME.zarr. Required without --explain.")
+        Path | None,
+        typer.Option(metavar="RECORDING", help="New recording NAME.zarr. Required without --explain."),
     ] = None,
     config: Annotated[
         str | None,

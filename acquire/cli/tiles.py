@@ -16,7 +16,9 @@ if TYPE_CHECKING:
 TileOption = Annotated[
     str | None,
     typer.Option(
-        "--tile", metavar="ROW,COLUMN", help="For a scene behind a fibre: the tile to use, counted from 0,0."
+        "--tile",
+        metavar="ROW,COLUMN",
+        help="For a scene behind a fibre: row and column of the tile to use, each counted from 0.",
     ),
 ]
 TilesOption = Annotated[
@@ -24,8 +26,8 @@ TilesOption = Annotated[
     typer.Option(
         "--tiles",
         metavar="ROWS,COLUMNS",
-        help="For a scene behind a fibre: the tiles to use, counted from 0. 1,2 is one tile, 0-1,2-4 are "
-        "six. Default: all tiles.",
+        help="For a scene behind a fibre: rows and columns of the tiles to use, counted from 0: 1,2 is one "
+        "tile, 0-1,2-4 are six tiles. Default: all tiles.",
     ),
 ]
 
@@ -55,7 +57,8 @@ def tiles_of(recording: Recording, text: str | None) -> tuple[Tile, ...]:
     if fibre is None:
         if text is not None:
             raise UsageError(
-                f"{recording} has no tiles, because it was not recorded behind a fibre", possible="no --tiles"
+                f"{recording} has no tiles, because it was not recorded behind a fibre",
+                possible="no --tile or --tiles",
             )
         return ()
     if text is None:

@@ -77,7 +77,7 @@ def tradeoff(
         typer.Option(help="Floating-point type to try, float32 or float64. Repeatable. Default: float32."),
     ] = None,
     repeats: Annotated[
-        int, typer.Option(min=1, max=20, help="Number of runs of each kind, for the bands of the curves.")
+        int, typer.Option(min=1, max=20, help="Number of runs of each kind, whose spread the curves show.")
     ] = 3,
     first_line: Annotated[
         int | None,

@@ -195,9 +195,14 @@ def monitor(
     config: ConfigOption = "rig-demo",
     url: UrlOption = None,
     settings: SetOption = None,
-    tags: Annotated[int | None, typer.Option(min=1, help="End after this number of tags.")] = None,
+    tags: Annotated[
+        int | None, typer.Option(min=1, help="End after this number of tags. Default: no limit.")
+    ] = None,
     seconds: Annotated[
-        float | None, typer.Option(parser=seconds_between(0), metavar="TIME", help="End after this time.")
+        float | None,
+        typer.Option(
+            parser=seconds_between(0), metavar="TIME", help="End after this time. Default: no limit."
+        ),
     ] = None,
     json: JsonFlag = False,
 ) -> None:

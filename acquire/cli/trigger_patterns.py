@@ -40,10 +40,10 @@ def blink(
     seconds: SecondsOption = None,
     json: JsonFlag = False,
 ) -> None:
-    """Let the light blink slowly enough for the eye, while the cameras get their line triggers.
+    """Blink the light slowly enough to see, while the cameras receive their line triggers.
 
     No camera is needed. The test shows that the trigger controls the light and which level turns it on: it is
-    dark before, between and after the flashes. It runs until Ctrl-C or --seconds, then the light is off.
+    dark before, between and after the flashes. It runs until Ctrl-C, or for --seconds; then the light is off.
 
     Example: [bold]acquire trigger blink --url /dev/ttyUSB0[/]
     """
@@ -64,8 +64,8 @@ def square(
         typer.Option(
             min=1,
             max=2**31,
-            help="Number of sub-steps for which the light is on, and then off. 1 is the fastest. Default: "
-            "one line.",
+            help="Number of sub-steps for which the light is on, and for which it is then off. 1 is the "
+            "fastest. Default: one line.",
         ),
     ] = None,
     seconds: SecondsOption = None,
@@ -75,8 +75,8 @@ def square(
 
     By default the light is on for one line and off for the next. Its edges then coincide with the line
     starts, so that an oscilloscope on the line trigger and a photodiode shows the delay of the light.
-    --substeps 1 is the fastest light of this rig. The test runs until Ctrl-C or --seconds, then the light is
-    off.
+    --substeps 1 is the fastest light of this rig. The test runs until Ctrl-C, or for --seconds; then the
+    light is off.
 
     Example: [bold]acquire trigger square --url /dev/ttyUSB0 --substeps 1[/]
     """

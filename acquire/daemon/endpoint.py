@@ -50,7 +50,7 @@ class Endpoint:
         if not path.parent.is_dir():
             raise UsageError(f"control socket {path}: its directory does not exist", hint=ELSEWHERE)
         if os.path.lexists(path) and not stat.S_ISSOCK(path.lstat().st_mode):
-            raise UsageError(f"control socket {path}: something else is there, and stays untouched")
+            raise UsageError(f"control socket {path}: something else is there, and is left untouched")
         self._lock = _lock(path)
         try:
             self.socket = _listen(path)
@@ -117,7 +117,7 @@ def _lock(path: Path) -> int:
     if not stat.S_ISREG(found.st_mode) or found.st_size > LONGEST_LOCK:
         os.close(lock)
         raise UsageError(
-            f"control socket {path}: {lock_path(path)} is not a lock of acquire, and stays untouched"
+            f"control socket {path}: {lock_path(path)} is not a lock of acquire, and is left untouched"
         )
     try:
         fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -132,7 +132,7 @@ def _lock(path: Path) -> int:
         if not os.path.lexists(path):  # otherwise each of two commands would send the user to the other
             raise StateError(
                 f"another daemon (process {owner}) listens on {path}, which was removed",
-                hint=f"kill {owner}, on which it seals its recording" if known else "",
+                hint=f"kill {owner}, after which it seals its recording and ends" if known else "",
             ) from None
         raise StateError(
             f"another daemon (process {owner}) listens on {path}", hint="acquire status, or another --socket"

@@ -130,7 +130,7 @@ class StartRequest(Message):
         if len(given) > 1:
             raise ValueError(f"{' and '.join(given)} exclude each other: give one")
         if self.duration_s is not None and self.pre_s >= self.duration_s:
-            raise ValueError("pre_s is a part of duration_s: give a smaller one")
+            raise ValueError("pre_s must be less than duration_s, which includes it")
         if self.resume and self.path is None:
             raise ValueError("resume needs the path of the recording to continue")
         if self.path is not None and not self.path.is_absolute():
@@ -394,7 +394,7 @@ def http_status(error: AcquireError) -> int:
 
 def fault_error(fault: str | None) -> DeviceError:
     """Return the error of a command that ends in a fault."""
-    return DeviceError(f"fault: {fault}", hint="acquire disarm, then look at the device")
+    return DeviceError(f"fault: {fault}", hint="acquire disarm, then check the device")
 
 
 def error_body(error: AcquireError) -> dict[str, Any]:

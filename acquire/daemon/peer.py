@@ -77,6 +77,6 @@ def _check_peer(connection: socket.socket, path: Path) -> None:
 
 def _impostor(path: Path, what: str) -> NoDaemonError:
     return NoDaemonError(
-        f"control socket {path} {what}, not to be trusted by user {os.geteuid()}: nothing was sent",
+        f"control socket {path} {what}, and is not trusted by user {os.geteuid()}: nothing was sent",
         hint=ELSEWHERE,
     )

@@ -118,7 +118,7 @@ def refusal(fixed: list[ChangedKey]) -> UsageError:
     listed = "; ".join(words(one) for one in fixed[:MOST_LISTED])
     more = f"; and {len(fixed) - MOST_LISTED} more" if len(fixed) > MOST_LISTED else ""
     return UsageError(
-        f"cannot change while the service works: {listed}{more}",
+        f"the daemon cannot change these while it runs: {listed}{more}",
         possible=f"changes of {', '.join(MAY_CHANGE)}",
-        hint="restart the service when it is idle, or revert these changes in the file",
+        hint="restart the daemon while it is idle, or revert these changes in the file",
     )

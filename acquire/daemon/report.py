@@ -23,7 +23,7 @@ class Rates:
     """Lines per second of each arm over the last seconds, and the saturated share of them.
 
     Lines come in blocks: a rate is measured from one change of the count to another, so that neither the size
-    of a block nor the moment of a look makes two arms differ.
+    of a block nor the moment of a reading makes two arms differ.
     """
 
     def __init__(self, now_s: Callable[[], float] = time.monotonic) -> None:

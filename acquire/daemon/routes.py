@@ -110,7 +110,7 @@ def _add_commands(router: APIRouter, api: Api, answers: Answers) -> None:
     async def disarm(request_id: RequestId = None) -> Status:
         return await once(request_id, "disarm", api.disarm)
 
-    # These two may be repeated without harm, and need no request ID.
+    # These two may be repeated without harm: their request ID is optional in practice, too.
     @router.post("/capacity", summary="idle: measure what ring, codec and disk sustain here, now")
     async def measure(request_id: RequestId = None) -> CapacityStatus:
         return await once(request_id, "capacity", api.measure)

@@ -1,6 +1,6 @@
 """The capture service: carries out commands, supervises the capture path, and publishes its status.
 
-One thread calls everything here except what stands under "any thread" in `Service`, such as its status:
+One thread calls everything here except what is listed under "any thread" in `Service`, such as its status:
 the device thread publishes an immutable `Status` after every change, and others read the latest.
 """
 
@@ -184,7 +184,9 @@ class Service:
     def measure(self) -> None:
         """Measure again what the host sustains; only while idle, since a run would disturb it."""
         if self._state is not State.IDLE:
-            raise StateError(f"cannot measure while {self._state}", possible=possible(self._state))
+            raise StateError(
+                f"the capacity cannot be measured while {self._state}", possible=possible(self._state)
+            )
         if self._prove is None:
             raise UsageError("this rig's capacity cannot be measured", hint="acquire bench --config RIG")
         self._busy = "capacity"

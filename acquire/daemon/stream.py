@@ -70,7 +70,7 @@ class Streams:
         due_s, begins = time.monotonic(), True
         try:
             while not self._log.closed:
-                # Cleared before the look, so that news that come during it wake the stream again.
+                # Cleared before reading, so that news that come meanwhile wake the stream again.
                 was_woken = woken.is_set()
                 woken.clear()
                 news = self._log.after(last_id)

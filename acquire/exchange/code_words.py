@@ -78,7 +78,7 @@ def _from_array(path: Path) -> NDArray[np.uint8]:
         with refused(path, "read"), path.open("rb") as file:
             raw = file.read(found.offset + found.nbytes)
         if len(raw) != found.offset + found.nbytes:
-            raise UsageError(f"{path} was changed while it was read", hint="again, once it is written")
+            raise UsageError(f"{path} was changed while it was read", hint="again, once it is complete")
         bits = np.frombuffer(raw, found.dtype, offset=found.offset)
         if np.isin(bits, (0, 1)).all():
             return np.asarray(bits, np.uint8)

@@ -293,7 +293,7 @@ def _raw(path: Path, layout: Layout, _: ExitStack) -> LineFile:
     # Refused, and not cut off: with a wrong width every line is displaced against the one before.
     if size % line_bytes:
         raise UsageError(
-            f"{path}: {size} bytes are not a whole number of lines of {pixels} pixels {dtype.name}",
+            f"{path}: {size} bytes are not a whole number of lines of {pixels} pixels of {dtype.name}",
             possible=f"{size // line_bytes} lines, with {size % line_bytes} bytes left over",
             hint="--skip-bytes for the bytes before the first line, or another --pixels or --dtype",
         )

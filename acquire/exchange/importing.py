@@ -189,7 +189,7 @@ def _check_span(instrument: Instrument, lines: int) -> None:
     needed = instrument.code_start + instrument.substeps * instrument.first_line + span
     if isinstance(code, ListedCode) and not code.repeats and code.length < needed:
         raise UsageError(
-            f"the code has {code.length} bits, and {lines} lines touch {needed}",
+            f"the code has {code.length} bits, but {lines} lines need {needed}",
             possible="S·(M + lines) − 1 bits, starting with the first line's",
             hint="--code-repeats, if the sequence repeats, or fewer --lines",
         )
@@ -197,7 +197,7 @@ def _check_span(instrument: Instrument, lines: int) -> None:
     most = min(ticks, int(seconds * instrument.line_rate_hz)) - lines - instrument.stages
     if instrument.first_line > most:
         raise UsageError(
-            f"line {instrument.first_line} is too late for a recording's clock", possible=f"up to line {most}"
+            f"line {instrument.first_line} is beyond a recording's clock", possible=f"up to line {most}"
         )
 
 

@@ -22,7 +22,7 @@ oom_score_adj.
 """
 _IMPORTANT = -15
 _SLICE_NS = 100_000
-"""The shortest that Linux allows, and more than a block of lines takes to copy."""
+"""The shortest that Linux allows (kernel/sched/syscalls.c), and more than copying a block of lines takes."""
 _SCHED_SETATTR = {"x86_64": 314, "aarch64": 274}
 """Numbers of a system call that the C library offers only since glibc 2.41."""
 
@@ -57,8 +57,9 @@ def become_urgent() -> bool:
 def become_prompt() -> bool:
     """Ask for the processor in short slices, and therefore soon; return whether the kernel took the request.
 
-    Shares of the processors stay the same, and no right is needed. Without it, who runs when a block of lines
-    arrives may go on to the end of a slice of some milliseconds. Linux before 6.12 ignores it.
+    Shares of the processors stay the same, and no right is needed. Without it, the process that runs when a
+    block of lines arrives may run on to the end of a slice of a few milliseconds. Linux before 6.12 does not
+    know the request.
     """
     number = _SCHED_SETATTR.get(platform.machine())
     if number is None or os.sched_getscheduler(0) != os.SCHED_OTHER:
@@ -83,7 +84,7 @@ def stand_back(nice: int, oom_score: int) -> None:
     """Lower the rank of this process and all that it starts: its work can be repeated, lines cannot."""
     os.nice(nice)
     # Then it never interrupts a running grabber when it wakes up. Its share of the processors stays the same.
-    with contextlib.suppress(OSError):  # a service that may not
+    with contextlib.suppress(OSError):  # refused in a restricted service
         os.sched_setscheduler(0, os.SCHED_BATCH, os.sched_param(0))
-    with contextlib.suppress(OSError):  # a kernel without it, or a service that may not
+    with contextlib.suppress(OSError):  # refused there, too, or unknown to the kernel
         Path("/proc/self/oom_score_adj").write_text(str(oom_score), encoding="ascii")

@@ -113,7 +113,7 @@ class Worker:
         if code is None:
             return None
         if code == UNKNOWN:
-            return "ended, and nobody is left to say how"
+            return "ended, with an unknown exit code"
         return f"killed by {signal.Signals(-code).name}" if code < 0 else f"ended with exit code {code}"
 
     @property
@@ -206,7 +206,7 @@ class Worker:
             self._child.close()
             raise DeviceError(
                 f"{self.name}: the process was killed, and has not ended within {_KILL_WAIT_S:g} s",
-                hint="it waits for a disk or device that does not answer, and ends when that does",
+                hint="check the disk or device that it waits for: it ends once that answers",
             )
         self._child.close()
         if forced:

@@ -218,7 +218,7 @@ def _hidden_lamp(
     predicted, noise = found.predict(), problem.noise(segment)
     left = EXPLAINED_BY_NOISE * noise if noise < np.inf else LEAST_MISSED  # NaN if it is unknown
     if options.bandwidth is not None or clock.spent(WIDER_SHARE):
-        return None  # nothing would be solved again: the end of the reconstruction tells of it
+        return None  # nothing would be solved again: `detect_unresolved_light` reports it at the end
     if not problem.prediction_error(predicted) > left:
         return None
     cosine_hz = 1 / (2e-9 * segment.substep_ns * options.temporal_merge * first.basis.frames)

@@ -21,7 +21,7 @@ camera's pixel. They are judged by their prior instead, with exponents of their 
                  alike that a wrong still explains them, too
     drift        whether the video moves farther and farther as its solver continues, as one cut short does
     fine         whether small voxels are the reason for judging by the prior: they explain clean lines to a
-                 part in a thousand while they are some percent off
+                 part in a thousand while they are a few percent off
 
 The exponents, and the factors within which nine of ten estimates lie, are fitted by
 ``tools/bench_error.py --fit`` to scenes of motion, lamps, photographs and stills, each estimated with

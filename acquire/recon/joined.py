@@ -3,7 +3,7 @@
     lines = B₁·θ₁ + B₂·θ₂        θ = (s·θ₁, θ₂) in one array, each part with a prior and a sign of its own
 
 The data step of `admm` is made in the space of the lines, where both parts meet in one residual. Solved in
-turns instead, each would first explain all lines by itself, and neither would give back what is the other's.
+turns instead, each part would first explain all lines alone, and neither would give up the other's share.
 The scale s sets the ratio of both parts' penalties: s² for each voxel of as many pixels.
 """
 

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from acquire.recon.result import Quality
 
 POOR_MISFIT = 0.15
-"""Relative residual above which a video is bad for certain: too few iterations, and lines that are not from
+"""Relative residual above which a video is certainly bad: too few iterations, and lines that are not from
 TDI cameras, end above it. A video below it may still be wrong: a wrong code or orientation ends at 2 to 7 %,
 because there are many voxels; `diagnosis` tells these apart."""
 WORTH_SAYING = 0.01

@@ -87,7 +87,7 @@ class SolveOptions:
 
         if self.choice is not None and not isinstance(self.choice, Choice):
             raise UsageError(
-                f"choice = {shown(self.choice)} is no choice of another video",
+                f"choice = {shown(self.choice)} is not the choice of another video",
                 possible="acquire.recon.reuse.Choice, or None",
             )
 
@@ -108,14 +108,14 @@ def check_hooks(stop: object, **functions: object) -> None:
         if function is not None and not callable(function):
             raise UsageError(f"{name} = {shown(function)} cannot be called", possible="a function, or None")
     if stop is not None and not callable(getattr(stop, "is_set", None)):
-        raise UsageError(f"stop = {shown(stop)} cannot be asked", possible="a threading.Event, or None")
+        raise UsageError(f"stop = {shown(stop)} has no method is_set", possible="a threading.Event, or None")
 
 
 def check_table(name: str, table: Mapping[str, Any] | None) -> None:
     """Raise UsageError unless options are given by name, or not at all."""
     if table is not None and not (hasattr(table, "keys") and all(isinstance(key, str) for key in table)):
         raise UsageError(
-            f"{name} = {shown(table)} are no named options", possible="a dictionary by name, or None"
+            f"{name} = {shown(table)} are not named options", possible="a dictionary by name, or None"
         )
 
 

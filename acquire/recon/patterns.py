@@ -165,7 +165,7 @@ class Refinement:
         self._start(replace(found, patterns=fine))
 
     def _start(self, found: Patterns) -> None:
-        """Begin ADMM, with the parameters of now, at patterns in pixels."""
+        """Begin ADMM, with the current parameters, at patterns in pixels."""
         self.found = found
         operator, basis = self._operators()
         fine = host(found.patterns)
@@ -261,7 +261,7 @@ class Refinement:
         return other
 
     def needed(self) -> Patterns:
-        """The strongest patterns of now, in pixels, without those that the held-out samples may not need.
+        """The strongest current patterns, in pixels, without those that the held-out samples may not need.
 
         A pattern of the scene is needed by far, whereas one too many only absorbs errors of the others.
         Without held-out samples all are needed.

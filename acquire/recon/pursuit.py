@@ -36,7 +36,7 @@ if TYPE_CHECKING:
     Begin = Callable[[LearnedBasis, Array | None], InBand]
     """Makes an estimate in a basis, from coefficients or from zero."""
 
-NONE = np.zeros(0, np.int64)
+NO_COSINES = np.zeros(0, np.int64)
 ROUND, ROUNDS = 10, 6
 """Number of iterations between two looks at the residual, and the largest number of these."""
 COARSE_SIDE = 48
@@ -76,8 +76,8 @@ def pursue(
     if fastest < 2 * FEWEST_COEFFICIENTS:
         return None
     residual_energy = _spectrum(segment, problem, merges[1], fastest)
-    lamps, dark = NONE, np.zeros(fastest, bool)
-    sure, told = NONE, None
+    lamps, dark = NO_COSINES, np.zeros(fastest, bool)
+    sure, told = NO_COSINES, None
     look = _Look.at_start(begin, _windows(lamps, fastest), frames, problem.arrays, still)
     for made in range(ROUNDS):
         for _ in iterations(look.estimate, ROUND):
@@ -100,7 +100,7 @@ def pursue(
         if not made and not len(found):
             return None
         lamps = np.concatenate([lamps, found])
-        look = look.moved(_windows(np.concatenate([lamps, NONE if told is None else told]), fastest))
+        look = look.moved(_windows(np.concatenate([lamps, NO_COSINES if told is None else told]), fastest))
     if told is None or not len(sure):
         return None
     # what is slower than a lamp costs little
@@ -161,11 +161,11 @@ class _Look:
 def _beyond(last: int, known: int, fastest: int) -> NDArray[np.int64]:
     """Cosines whose windows hold the fastest lamp of the lines' covariance, if that is beyond the known ones.
 
-    It tells no more than the end of the lamp's peak, and of long segments as that of a part.
+    It only gives the end of the lamp's peak and, in long segments, that of a part.
     """
     spread = 2 * BESIDE + 1
     if not known + 2 * spread < last <= fastest - BESIDE:
-        return NONE
+        return NO_COSINES
     return np.array([last - 1 - spread, last - 1])
 
 

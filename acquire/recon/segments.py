@@ -54,7 +54,7 @@ class Stretch:
     def __post_init__(self) -> None:
         if self.end <= self.begin:
             raise UsageError(
-                f"a stretch cannot go from sub-step {self.begin} to {self.end}",
+                f"a range cannot go from sub-step {self.begin} to {self.end}",
                 possible="an end after the beginning",
             )
 
@@ -115,7 +115,7 @@ class Stream:
             raise UsageError(
                 f"no voxel of {last.temporal_merge} sub-steps is sampled in full by {geometry.lines} lines",
                 possible=f"more than {self.stages} lines and a shorter T_m",
-                hint="or keep what is sampled in part (whole ends)",
+                hint="or keep the voxels that are sampled only in part (whole ends)",
             )
         return origin + begin, origin + end
 
@@ -164,7 +164,9 @@ class Stream:
         """
         for before, after in pairwise(stretches):
             if before.end != after.begin:
-                raise UsageError(f"a stretch ends at sub-step {before.end}, the next begins at {after.begin}")
+                raise UsageError(
+                    f"a range ends at sub-step {before.end}, but the next one begins at {after.begin}"
+                )
         # 0 for slow ones: no seam with them fades
         lengths = [
             0 if self.is_slow(stretch.voxels) else stretch.end - stretch.begin for stretch in stretches

@@ -34,7 +34,7 @@ class Budget:
     def __init__(self, seconds: float | None, began: float, workers: int) -> None:
         self.seconds, self._began, self._workers = seconds, began, workers
         self._compiled_s = 0.0
-        # measuring it occupies a core for some hundredths of a second
+        # measuring it occupies a core for a few hundredths of a second
         self._slowness = 1.0 if seconds is None else slowness()
         self._writing_s_per_voxel = WRITING_S_PER_VOXEL * self._slowness
 

@@ -201,7 +201,7 @@ def _cluster(address: str) -> Iterator[Cluster]:
         (await connect(address, timeout=SCHEDULER_TIMEOUT_S, **secrets)).abort()  # type: ignore[no-untyped-call]
 
     try:
-        # A Client that cannot connect is left half made, and its end waits for 20 s and prints a traceback.
+        # A Client that cannot connect stays half constructed: closing it takes 20 s and prints a traceback.
         asyncio.run(knock())
         client = Client(  # type: ignore[no-untyped-call]
             address, timeout=SCHEDULER_TIMEOUT_S, set_as_default=False

@@ -151,7 +151,8 @@ def in_voxels(
     check_integers(longest=1 if longest is None else longest)
     if longest is not None and longest < 1:
         raise UsageError(
-            f"sub-segments of {longest} sub-steps are not possible", possible="1 or more, or None: by default"
+            f"sub-segments of {longest} sub-steps are not possible",
+            possible="1 or more, or None for the default",
         )
     stream.geometry(1).check_merge(voxels.spatial_merge, voxels.temporal_merge)
     whole = voxels.temporal_merge >= 2 * size if whole_ends is None else whole_ends

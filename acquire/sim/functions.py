@@ -84,7 +84,7 @@ def checked_light(light: Any, shape: tuple[int, ...], what: str) -> NDArray[np.f
         raise UsageError(f"the light of {what} is not finite: {nan} pixels are NaN, {infinite} infinite")
     if frames.size and frames.min() < 0:
         raise UsageError(
-            f"the light of {what} must not be negative, and is as low as {frames.min():g}",
+            f"the light of {what} must not be negative, but is as low as {frames.min():g}",
             possible="0 or more",
         )
     return frames

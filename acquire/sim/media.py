@@ -132,7 +132,7 @@ def open_media(path: Path) -> Source:
     try:
         there = path.is_file()
     except PermissionError as error:
-        raise UsageError(f"scene file {path} cannot be looked at: {error.strerror}") from error
+        raise UsageError(f"scene file {path} cannot be accessed: {error.strerror}") from error
     if not there:
         raise UsageError(f"scene file {path} does not exist")
     if path.suffix == ".npy":

@@ -27,6 +27,6 @@ class Run:
     budget: int | None = None
     """Lines after which the run ends in any case."""
     bark_tick: int | None = None
-    """Time at which the watchdog ends the run, unless the host is heard before."""
+    """Time at which the watchdog ends the run, unless a request from the host comes first."""
     limit: int | None = None
     """Final number of lines of a run that is stopping."""

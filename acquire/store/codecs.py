@@ -122,7 +122,7 @@ def choose_codec(
     threads: int = 1,
     margin: float = 1.5,
 ) -> CodecChoice:
-    """Choose the codec that records ``bytes_per_s`` here with ``margin``; takes some tenths of a second.
+    """Choose the codec that records ``bytes_per_s`` here with ``margin``; takes a few tenths of a second.
 
     ``lines`` (line, pixel) are like those to come, some MB of them; ``disk_bytes_per_s`` is the rate that the
     disk sustains; ``threads`` pack in parallel. Among the codecs that sustain the rate with ``margin`` the

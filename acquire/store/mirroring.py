@@ -214,9 +214,7 @@ class Mirror:
         """
         recording = open_recording(self.path)
         if _identity(recording.attrs) != self._identity:
-            raise DataError(
-                f"{self.path} is not the same recording any more: run {recording.attrs['run_id']}"
-            )
+            raise DataError(f"{self.path} is no longer the same recording: run {recording.attrs['run_id']}")
         sealed = recording.state == "sealed"
         if sealed and not self._sealed:  # a recovery may have mended files that are copied already
             refuse_links(self.path)

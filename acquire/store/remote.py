@@ -258,12 +258,12 @@ def _url_errors(url: str) -> Iterator[None]:
             ) from error
         raise UsageError(
             f"{url} cannot be opened: {error}",
-            possible=f"{', '.join(OBJECT_STORES)}, file, memory and what else fsspec has a package for",
+            possible=f"{', '.join(OBJECT_STORES)}, file, memory and others for which fsspec has a package",
             hint="pip install 'tdi-acquire[remote]'",
         ) from error
     except Exception as error:  # every file system has errors of its own
         raise StoreError(
-            f"{url} cannot be opened: {_words(error)}", hint="the network, and the address"
+            f"{url} cannot be opened: {_words(error)}", hint="check the network and the address"
         ) from error
 
 

@@ -53,7 +53,7 @@ def next_segment(path: Path, spec: RecordingSpec, cause: str = "interrupted") ->
     segments = [first, *first.segments]
     last = segments[-1]
     if any(segment.state != "sealed" for segment in segments):
-        raise UsageError(f"resuming {path}: it is not sealed", hint=f"acquire recover {last}")
+        raise UsageError(f"{path} cannot be resumed: it is not sealed", hint=f"acquire recover {last}")
     number = len(segments) + 1
     follows = Continuation(path.name, number, last.first_line + last.lines, last.end_ns(), cause)
     # In the same directory, since recordings know their segments by name alone.
@@ -123,10 +123,10 @@ def _check_alike(first: Recording, spec: RecordingSpec) -> None:
     for key, value in asked.items():
         if first.attrs[key] != value:
             raise UsageError(
-                f"resuming {first} needs the same {key}, and not {value}", possible=str(first.attrs[key])
+                f"resuming {first} needs the same {key}, not {value}", possible=str(first.attrs[key])
             )
     if first.arms[ARMS[0]].dtype != spec.line_dtype:
         raise UsageError(
-            f"resuming {first} needs the same samples, and not {spec.dtype}",
+            f"resuming {first} needs the same samples, not {spec.dtype}",
             possible=str(first.arms["a"].dtype),
         )

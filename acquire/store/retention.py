@@ -65,12 +65,12 @@ def hold(path: Path, first_line: int, count: int, why: str = "", disk: Disk = DI
     recording = open_recording(path)
     if recording.state == "sealed":
         raise UsageError(
-            f"{path} is sealed: its lines need not be held", possible="nothing of it is deleted any more"
+            f"{path} is sealed: its lines need not be held", possible="no hold: none of its lines are dropped"
         )
     if first_line + count <= recording.first_line:
         raise UsageError(
             f"lines {first_line} to {first_line + count - 1} cannot be held: they came before the recording",
-            possible=f"{recording.first_line} on",
+            possible=f"lines from {recording.first_line} on",
         )
     held = Hold(first_line, count, why)
     directory = _holds(path)

@@ -115,8 +115,8 @@ def _open_again(mailbox: Mailbox, plan: GrabberPlan, why: str) -> Camera:
     while (camera := _try_open(plan)) is None:
         if time.monotonic() >= deadline:
             raise CameraLostError(
-                f"camera {plan.arm} is gone: {why}",
-                hint=f"it did not come back within {plan.reopen_timeout_s:g} s",
+                f"camera {plan.arm} is gone: {why}; it did not come back within {plan.reopen_timeout_s:g} s",
+                hint="check cable and power, then arm again",
             )
         mailbox.take()  # raises OwnerGone once the run is over
         time.sleep(_REOPEN_PAUSE_S)

@@ -269,7 +269,7 @@ class Lifecycle:
     def on_overdue(self) -> None:
         """Note that the recorder has not answered in time: the recording is cancelled."""
         self._go(Event.OVERDUE)
-        self._end_reason = "cancelled"  # should it begin all the same
+        self._end_reason = "cancelled"  # in case it begins nevertheless
 
     def on_killed(self, death: str, committed_lines: int, now_s: float) -> Begin | None:
         """Note that another recorder took over. Return the recording it is to begin now, if any."""
@@ -287,7 +287,7 @@ class Lifecycle:
             # Killed again before it began: the counters may belong to neither recording.
             self._begin, committed_lines = once_more(begin), 0
         if self._begin.path != begin.path:  # else it was killed before it had made anything
-            why = f"its recorder was {death}; it goes on in {self._begin.path.name}"
+            why = f"its recorder was {death}; it continues in {self._begin.path.name}"
             self._leave(Orphan(begin.path, why, committed_lines))
         if was is Stage.PAUSED:
             self.resumption.ended(now_s, f"its recorder was {death}")

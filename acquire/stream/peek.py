@@ -34,7 +34,7 @@ class ForeignBytes(SharedBytes):
         except OSError as error:
             raise DeviceError(
                 f"the lines cannot be read: {path}: {error.strerror}",
-                hint="run as the daemon's user, on its host, with no fewer capabilities than it has",
+                hint="run as the daemon's user, on its host, with at least the daemon's capabilities",
             ) from error
         # The path names a number of the owner's, which may stand for another file by now.
         if os.fstat(self._fd).st_size != size:

@@ -57,7 +57,7 @@ _BLOCKS_PER_TURN = 8
 _CALM_BLOCKS = 2
 """With more blocks waiting, the disk writes while the next blocks are prepared: two processors, not one."""
 _LONGEST_DRAIN_S = 0.05
-"""Longest time that messages and commits wait."""
+"""Longest time that messages and commits wait for a drain."""
 _CROSSING = {Cancel: RecorderEvent.CANCEL, Extend: RecorderEvent.EXTEND, End: RecorderEvent.END}
 """Commands that may be on their way when a recording ends: without a row in the table they are ignored."""
 

@@ -150,7 +150,7 @@ def continuation(begin: Begin, began: Began, committed_lines: int, why: str) -> 
     # At least one, as a window requires: all lines of a recording that was not sealed may be committed.
     left = None if began.end_line is None else max(1, began.end_line - at)
     cause = f"its recorder was {why}"
-    text = f"goes on from {begin.path.name}: {cause}"
+    text = f"continues from {begin.path.name}: {cause}"
     window = Window(at, post_lines=left, exact=False, padded=True, kind="resumed", text=text)
     spec, before = begin.spec, begin.spec.continues
     first, number = (begin.path.name, 2) if before is None else (before.first, before.number + 1)
@@ -170,7 +170,7 @@ def resumed(begin: Begin, began: Began, end_line: int, why: str) -> Begin | None
     spec, before = begin.spec, begin.spec.continues
     first, number = (begin.path.name, 2) if before is None else (before.first, before.number + 1)
     follows = Continuation(first, number, end_line, readout_ns(spec, end_line), why)
-    window = Window(kind="resumed", text=f"goes on from {begin.path.name}: {why}")
+    window = Window(kind="resumed", text=f"continues from {begin.path.name}: {why}")
     path = free_name(begin.path.with_name(first))
     spec = replace(spec, continues=follows)
     return replace(begin, path=path, spec=spec, lines=None, window=window, end_line=began.end_line)

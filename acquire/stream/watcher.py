@@ -1,6 +1,6 @@
 """The process that checks lines while they pass: does the light follow the code, was a level crossed?
 
-It observes the rings, nobody waits for it, and it reports to the capture's owner. A dead or late watcher
+It observes the rings, no process waits for it, and it reports to the capture's owner. A dead or late watcher
 costs no line: lines that it missed are not checked, which its counters show.
 
 ::

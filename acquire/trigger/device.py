@@ -79,13 +79,13 @@ class Device:
         if values[r.ID] != r.DEVICE_ID:
             raise TriggerError(
                 f"{name} answers with ID {values[r.ID]:#010x}, not the trigger's {r.DEVICE_ID:#010x}",
-                hint="is it the trigger's port?",
+                hint="check that it is the trigger's port",
             )
         theirs = r.VERSION.protocol.of(values[r.VERSION])
         if (theirs, values[r.MAP]) != (r.PROTOCOL_VERSION, r.MAP_CRC):
             raise TriggerError(
                 f"{name} has protocol {theirs} with register map {values[r.MAP]:#010x}, "
-                f"this program protocol {r.PROTOCOL_VERSION} with map {r.MAP_CRC:#010x}",
+                f"but this program has protocol {r.PROTOCOL_VERSION} with map {r.MAP_CRC:#010x}",
                 hint="load the firmware that belongs to this program",
             )
         self.capabilities = Capabilities.read(values)
@@ -126,7 +126,7 @@ class Device:
         while not done(status := self.status()):
             if time.monotonic() > deadline_s:
                 now = self.read(r.TIME) if ticks else 0
-                # A clock that stands still says nothing: without this, a device that lost it is waited for.
+                # A stopped clock measures nothing: without this, a device without a clock is awaited forever.
                 if now == seen or signed_ticks(seen - begun) > ticks:
                     given_s = deadline_s - begun_s
                     raise TriggerError(f"the trigger did not {what} within {given_s:.3g} s: {status}")
@@ -135,7 +135,7 @@ class Device:
         return status
 
     def line_ticks(self) -> int:
-        """Return the length of a line as the device is configured, whoever did it."""
+        """Return the length of a line as the device is configured, by whichever program."""
         return int(r.LINE.substeps.of(self.read(r.LINE)) * self.read(r.SUBSTEP_CLOCKS))
 
     def counters(self) -> dict[str, int]:

@@ -241,7 +241,7 @@ class Dialogue:
             tried = f"{call.attempts} attempts of {self.reply_s:g} s"
             call.failure = TriggerError(
                 f"{self._name}: no answer to {call.kind.name} came in {tried}",
-                hint="is it the trigger's port, and its baud rate?",
+                hint="check that it is the trigger's port, and the baud rate",
             )
 
 
@@ -265,7 +265,7 @@ def results(calls: Sequence[Call]) -> list[Frame]:
         error, address = parse_nak(answer.payload)
         if error == ErrorCode.BAD_VERSION:  # the only refusal that does not concern the request itself
             raise TriggerError(
-                f"the trigger speaks protocol {answer.version}, this program {PROTOCOL_VERSION}",
+                f"the trigger speaks protocol {answer.version}, but this program speaks {PROTOCOL_VERSION}",
                 hint="load the firmware that belongs to this program",
             )
         raise RefusedError(error, address)

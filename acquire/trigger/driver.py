@@ -120,7 +120,7 @@ class TriggerDriver:
                 # End a run that our stop did not reach, but no run that this driver was not asked to stop.
                 if status.run != self._owed:
                     raise TriggerError(
-                        f"run {run.run_id!r} prepared while another one runs: "
+                        f"run {run.run_id!r} cannot be prepared while another one runs: "
                         f"number {status.run:#018x} is {status}",
                         hint="stop it first: acquire trigger stop",
                     )

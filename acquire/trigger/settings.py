@@ -169,7 +169,7 @@ def _check_timing(run: TriggerRun, config: TriggerConfig, device: Capabilities, 
     if config.clock_hz != device.clock_hz:
         raise TriggerError(
             f"trigger.clock_hz is {config.clock_hz} Hz, which is not the clock of this device",
-            possible=f"{device.clock_hz} Hz, as this device has",
+            possible=f"{device.clock_hz} Hz, the clock of this device",
             hint="set trigger.clock_hz, and substep_ticks with it",
         )
     if not device.substep_ticks_min <= run.substep_ticks <= device.substep_ticks_max:

@@ -79,7 +79,7 @@ class Reading:
 
     async def __call__(self, work: Callable[[], T]) -> T:
         if self._waiting >= MOST_READING:
-            raise UsageError("too many requests are reading already", hint="try again in a moment")
+            raise UsageError("too many requests are reading recordings already", hint="again in a moment")
         self._waiting += 1
         try:
             return await asyncio.get_running_loop().run_in_executor(self._thread, work)

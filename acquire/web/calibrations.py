@@ -26,7 +26,7 @@ def place_of(directory: Path, setup: Setup | None) -> tuple[Path, bool]:
     Raises NoDaemonError if the rig is not known yet.
     """
     if setup is None:
-        raise NoDaemonError("the daemon has not reported its rig yet", hint="try again in a moment")
+        raise NoDaemonError("the daemon has not reported its rig yet", hint="again in a moment")
     named = setup.config.get("calibration")
     return (Path(str(named)), True) if named else (directory / RECORDINGS / UNNAMED, False)
 

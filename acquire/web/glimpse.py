@@ -128,7 +128,7 @@ class Glimpses:
             iterations=ITERATIONS,
             bandwidth=1.0,
             check=False,  # testing whether other settings explain the lines better takes ten times as long
-            error=False,  # its estimate, which nobody sees, takes more iterations than the video
+            error=False,  # its estimate, which is not shown, takes more iterations than the video
         )
 
     def close(self) -> None:

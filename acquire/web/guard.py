@@ -155,7 +155,7 @@ class Guard:
     def _refusal_of_role(self, request: Request, address: str) -> JSONResponse | None:
         # Before the token is compared, so that guessing on yields nothing, not even with the right one.
         if not self._wrong.has_room(address):
-            return _refuse(429, "too many wrong tokens came from this address", "again in some seconds")
+            return _refuse(429, "too many wrong tokens came from this address", "again in a few seconds")
         role = self.role_of(request)
         if role is None:
             # Only an explicit token counts as a guess: a page whose cookie has expired repeats its requests.

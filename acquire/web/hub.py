@@ -73,7 +73,7 @@ class Hub:
                     await self._follow(reader)
                 except (AcquireError, OSError) as error:
                     self._lose(error)
-                # Such as no thread for a connection. The last state must not be shown for ever.
+                # For example, no thread is free for a connection; the last state must not be shown for ever.
                 except Exception as error:
                     if str(error) != self.why:  # once, and not at every try
                         log.exception("following the daemon")

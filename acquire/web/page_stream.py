@@ -55,7 +55,7 @@ class Pages:
             hub.glimpser.watch()
         try:
             while True:
-                # Cleared before the look, so that news that come during it wake the page again.
+                # Cleared before reading, so that news that come meanwhile wake the page again.
                 woken.clear()
                 parts: list[bytes] = []
                 next_news, news = hub.news_after(next_news)

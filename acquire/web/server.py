@@ -141,7 +141,7 @@ def directory_of(socket: Path) -> Path:
 
     disk = Client(socket).status().disk
     if disk is None:
-        raise NoDaemonError("the daemon has not checked its disk yet", hint="try again in a moment")
+        raise NoDaemonError("the daemon has not checked its disk yet", hint="again in a moment")
     return Directory(disk.directory)
 
 

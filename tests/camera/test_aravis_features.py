@@ -145,7 +145,7 @@ def test_a_command_is_waited_for_until_the_camera_has_carried_it_out(
         assert read(described, "LoadRegister") == 0
         carried_out.result()
     monkeypatch.setattr(settings, "COMMAND_S", 0.1)
-    with pytest.raises(CameraError, match=r"LoadSettings is not done after 0\.1 s; possible: .*; try: the"):
+    with pytest.raises(CameraError, match=r"LoadSettings is not done after 0\.1 s; possible: .*; try: look"):
         apply(described, ("remote", "LoadSettings", True))
     apply(described, ("remote", "Forget", True))  # its register cannot be read: nothing to wait for
     assert read(described, "LoadRegister") == 7

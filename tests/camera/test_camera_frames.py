@@ -163,12 +163,12 @@ def test_a_camera_that_counts_anew_is_opened_again_and_not_ignored() -> None:
     count.place(FrameFacts(10_000))
     for number in range(256):
         assert count.place(FrameFacts(number)) is None
-    with pytest.raises(CameraLostError, match="after id 10000 came"):
+    with pytest.raises(CameraLostError, match="after id 10000, 257 frames"):
         count.place(FrameFacts(256))
 
 
 def test_a_first_frame_before_the_first_id_is_refused() -> None:
-    with pytest.raises(CameraError, match="first frame has id 0, and ids begin at 1"):
+    with pytest.raises(CameraError, match="first frame has id 0, but ids are set to begin at 1"):
         FrameCount(H, first_id=1).place(FrameFacts(0))
 
 

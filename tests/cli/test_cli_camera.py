@@ -53,7 +53,7 @@ def of_host(producers: str) -> list[dict[str, str]]:
 def test_without_a_rig_every_transport_lists_its_devices() -> None:
     rows = {row["device"]: row["state"] for row in of_host("")}
     assert list(rows) == ["trigger, serial", "trigger, USB", "camera, GenTL", "camera, Aravis"]
-    assert "try: cti in the camera's table, or GENICAM_GENTL64_PATH" in rows["camera, GenTL"]
+    assert "try: set cti in the camera's table, or GENICAM_GENTL64_PATH" in rows["camera, GenTL"]
 
 
 @pytest.mark.needs_genicam

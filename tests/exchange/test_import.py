@@ -211,7 +211,7 @@ def test_a_thumbnail_beside_the_lines_of_a_tiff_file_does_no_harm(tmp_path: Path
     [
         (["short.npy", "b.npy", *SIZES], "--lines 149, to take this number of each"),
         (["a.npy", "b.npy", *SIZES, "--stages", 9], "lines of arm a have 8 pixels, with 9 stages"),
-        (["a.npy", "b.npy", *SIZES[:-1], "bits:0xff00"], "the code has 16 bits, and 150 lines touch 315"),
+        (["a.npy", "b.npy", *SIZES[:-1], "bits:0xff00"], "the code has 16 bits, but 150 lines need 315"),
         (["a.npy", "b.npy", *SIZES[:-1], "prbs:64"], "possible: prbs:DEGREE:SEED"),
         (["a.npy", "b.npy", *SIZES[:-1], "bits:a.npy"], "does not hold bits"),
         (["a.npy", "b.npy", *SIZES[:4]], "cannot be imported without --line-rate, --code"),

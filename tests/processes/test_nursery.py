@@ -172,7 +172,7 @@ def test_a_nursery_that_dies_is_replaced_and_its_workers_go_on(mortal: Own) -> N
     another.end(deadline())
     assert worker.pid is not None
     os.kill(worker.pid, signal.SIGKILL)
-    until(lambda: worker.death == "ended, and nobody is left to say how")
+    until(lambda: worker.death == "ended, with an unknown exit code")
     worker.end(deadline())
 
 

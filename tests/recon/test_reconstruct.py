@@ -190,12 +190,12 @@ def test_what_cannot_be_is_refused_with_what_can() -> None:
         (UsageError, "bandwidth = '1' is not a number", {"bandwidth": "1"}),
         (UsageError, "tv_weight = True is not a number", {"tv_weight": True}),
         (UsageError, r"budget_s = \[5\] is not a number", {"budget_s": [5]}),
-        (UsageError, "solver_options = 5 are no named options", {"solver_options": 5}),
-        (UsageError, "solver_options = {1: 2} are no named options", {"solver_options": {1: 2}}),
+        (UsageError, "solver_options = 5 are not named options", {"solver_options": 5}),
+        (UsageError, "solver_options = {1: 2} are not named options", {"solver_options": {1: 2}}),
         (UsageError, "progress = True cannot be called", {"progress": True}),
         (UsageError, "look = 'x' cannot be called", {"look": "x"}),
-        (UsageError, "stop = True cannot be asked", {"stop": True}),
-        (UsageError, "choice = 'tv' is no choice", {"choice": "tv"}),
+        (UsageError, "stop = True has no method is_set", {"stop": True}),
+        (UsageError, "choice = 'tv' is not the choice", {"choice": "tv"}),
     ):
         with pytest.raises(error, match=match):
             reconstruct(good, 3, 1, **call)

@@ -199,7 +199,7 @@ def test_impossible_requests_are_refused_with_an_explanation(
         yield from bps.kickoff(recorder, wait=True)
 
     assert "recorder is not staged" in in_words(engine, unstaged())
-    assert "cannot prepare with 7" in in_words(engine, fly(recorder, 7))  # type: ignore[arg-type]
+    assert "cannot be prepared with 7" in in_words(engine, fly(recorder, 7))  # type: ignore[arg-type]
     nowhere = StartRequest(path=tmp_path / "no/run.zarr")
     assert "no/run.zarr" in in_words(engine, fly(recorder, nowhere))
     with daemon.client() as client:

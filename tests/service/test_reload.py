@@ -100,9 +100,9 @@ def test_a_reload_with_a_fixed_key_is_refused_as_a_whole(daemon: Daemon) -> None
         ):
             assert f"{key} = {new}, it was {old}" in said
         assert "recording.retention" not in said.partition("possible:")[0]
-        assert "restart the service when it is idle" in said
+        assert "restart the daemon while it is idle" in said
         assert client.setup().config == before
-        assert "nothing was changed: cannot change while the service works" in news_of(client)
+        assert "nothing was changed: the daemon cannot change these while it runs" in news_of(client)
         assert client.status().state is State.ARMED
     refused = daemon("reload", "--json")
     assert refused.code == 2

@@ -87,11 +87,11 @@ def test_a_recorder_is_killed_twice_and_a_stop_leaves_nothing_open(start: Start)
     first = record(daemon)
     kill_recorder(daemon)
     until(lambda: recovery(daemon, "x.zarr")[0] == "recovered")  # while its successor records
-    assert end_of(first) == ("sealed", "INTERRUPTED", f"{KILLED}; it goes on in x-2.zarr")
+    assert end_of(first) == ("sealed", "INTERRUPTED", f"{KILLED}; it continues in x-2.zarr")
     kill_recorder(daemon)
     assert daemon("stop").code == 0
     second, third = (daemon.home / name for name in ("x-2.zarr", "x-3.zarr"))
-    assert end_of(second) == ("sealed", "INTERRUPTED", f"{KILLED}; it goes on in x-3.zarr")
+    assert end_of(second) == ("sealed", "INTERRUPTED", f"{KILLED}; it continues in x-3.zarr")
     assert end_of(third)[::2] == ("sealed", "stopped")
     assert all(verify(path).intact for path in (first, second, third))
     assert open_recording(first).attrs["segments"] == ["x-2.zarr", "x-3.zarr"]

@@ -220,7 +220,7 @@ def test_another_recording_is_not_written_over(path, tmp_path):
         mirror(other, place)
     path.rename(tmp_path / "moved.zarr")
     other.rename(path)
-    with pytest.raises(DataError, match="not the same recording any more"):
+    with pytest.raises(DataError, match="no longer the same recording"):
         copying.step()
     RemoteSource(place).put("zarr.json", b"{")
     with pytest.raises(UsageError, match="another recording: run run-1"):

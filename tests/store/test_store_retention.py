@@ -220,7 +220,7 @@ def test_holds_that_cannot_be_are_refused(path):
             with pytest.raises(UsageError, match="held"):
                 hold(path, first, count)
         writer.seal(RunCondition.GOOD, "done", {})
-    with pytest.raises(UsageError, match=r"sealed.*possible: nothing of it is deleted"):
+    with pytest.raises(UsageError, match=r"sealed.*possible: no hold"):
         hold(path, 1000, 5)
 
 

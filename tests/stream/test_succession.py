@@ -132,7 +132,7 @@ def test_a_recorder_that_is_killed_is_replaced_and_no_line_is_lost(run, tmp_path
     assert seen.fault is None
     assert seen.path == str(tmp_path / "r-2.zarr")
     (orphan,) = seen.orphans
-    why = "its recorder was killed by SIGKILL; it goes on in r-2.zarr"
+    why = "its recorder was killed by SIGKILL; it continues in r-2.zarr"
     assert orphan == Orphan(tmp_path / "r.zarr", why, orphan.committed_lines)
     assert 2000 < orphan.committed_lines <= lines
     recover(orphan.path)

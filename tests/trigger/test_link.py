@@ -124,7 +124,7 @@ def test_a_device_of_another_protocol_is_named_with_both_versions() -> None:
 
     with (
         linked(Scripted(answer)) as link,
-        pytest.raises(TriggerError, match="speaks protocol 9, this program 1"),
+        pytest.raises(TriggerError, match="speaks protocol 9, but this program speaks 1"),
     ):
         link.read(0)
 

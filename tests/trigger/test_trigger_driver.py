@@ -90,7 +90,7 @@ class Impostor:
     ("register", "value", "words"),
     [
         (r.ID, 7, "answers with ID 0x00000007, not the trigger's 0x54494454"),
-        (r.MAP, 7, f"register map 0x00000007, this program protocol 1 with map {r.MAP_CRC:#010x}"),
+        (r.MAP, 7, f"register map 0x00000007, but this program has protocol 1 with map {r.MAP_CRC:#010x}"),
         (r.VERSION, 2, "has protocol 2 with register map"),
     ],
 )

@@ -75,7 +75,7 @@ def demo(
 ) -> None:
     """Record Scene #1 of the paper with a simulated rig, reconstruct it, and write a report.
 
-    The command starts, arms and records with a real daemon, and stops it again afterwards.
+    The command starts a real daemon, arms it, records with it, and stops it again afterwards.
 
     Example: [bold]acquire demo --out /tmp/demo --seed 7[/]
     """

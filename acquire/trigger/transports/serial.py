@@ -108,7 +108,7 @@ def _not_opened(url: str, error: Exception, local: bool) -> TriggerError:
     if getattr(error, "errno", None) in (errno.EACCES, errno.EPERM):
         return TriggerError(f"{url} may not be opened: permission denied", hint=UDEV_HINT)
     if not local:
-        return TriggerError(f"{url} cannot be opened: {error}", hint="is it the right address?")
+        return TriggerError(f"{url} cannot be opened: {error}", hint="check the address")
     ports = ", ".join(sorted(port.device for port in comports()))
     what = "is not there" if not Path(url).exists() else f"cannot be opened: {error}"
     return TriggerError(f"{url} {what}", possible=ports or "no serial port", hint="check cable and power")

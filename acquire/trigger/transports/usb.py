@@ -127,7 +127,7 @@ class UsbTransport:
             if len(ways) == 2:
                 usb.util.claim_interface(self._device, interface.bInterfaceNumber)
                 return ways[_IN], ways[usb.util.ENDPOINT_OUT]
-        raise TriggerError(f"{self.name} has no interface with a bulk endpoint each way")
+        raise TriggerError(f"{self.name} has no interface with a bulk endpoint in each direction")
 
     def _gone(self, error: usb.core.USBError) -> TriggerError:
         what = "was unplugged" if error.errno == errno.ENODEV else "failed"

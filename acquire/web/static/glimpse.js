@@ -14,7 +14,7 @@ export class Glimpse {
       const wanted = $("glimpse-on").checked;
       link.wantGlimpses(wanted);
       $("glimpse").hidden = !wanted;
-      $("glimpse-text").textContent = wanted ? "The first glimpse takes some seconds." : "";
+      $("glimpse-text").textContent = wanted ? "The first picture takes a few seconds." : "";
       clearInterval(this.#timer);
       if (wanted) this.#timer = setInterval(() => this.#draw(), FRAME_MS);
       this.#header = null;

@@ -21,7 +21,7 @@ from acquire.sim.scene import MaskScene, SceneModel
 
 
 class Flicker(Effect):
-    """A lamp on the mains: its light swings with twice their frequency."""
+    """A lamp on the mains: its light varies at twice the mains frequency."""
 
     kind: Literal["flicker"]
     place: ClassVar[Place] = "light"
@@ -70,7 +70,7 @@ class StarScene(MaskScene):
 
 
 class RampCameras(CameraVariant):
-    """Cameras whose line k has the pixels step·k + column: whoever reads them knows what must be there."""
+    """Cameras whose line k has the pixels step·k + column, so that a reader knows what to expect."""
 
     simulated: ClassVar[bool] = True  # it is pulsed by the simulated trigger
     sees_light: ClassVar[bool] = False  # its lines do not follow the light's code
@@ -115,7 +115,7 @@ class Ramp:
 
 
 class SlowLinkTrigger(SimulatedTrigger):
-    """The simulated trigger behind a link that is slow: what it sends comes late."""
+    """The simulated trigger behind a slow link: its messages come late."""
 
     delay_s: float = Field(default=0.002, ge=0, le=0.05)
 
@@ -125,7 +125,7 @@ class SlowLinkTrigger(SimulatedTrigger):
 
 
 class SlowLink:
-    """Carries bytes as another way does, later."""
+    """Carries bytes as another transport does, but later."""
 
     def __init__(self, way, delay_s):
         self.name, self.bytes_per_s = f"{way.name}, slowed down", way.bytes_per_s
@@ -163,7 +163,7 @@ class LeastSquares(Solver):
 
 @dataclass
 class Answer:
-    """What a solver ends with."""
+    """The result of a solver."""
 
     model: Any
     norm: float
