@@ -105,7 +105,18 @@ class HarvestersCamera:
         try:
             self._found = self._library.pick(spec.serial, spec.model)
             self._acquirer = self._library.create(self._found)
-            self._features = _modules(self._acquirer)
+            streams: Sequence[Any] = self._acquirer.data_streams
+            # Producers may lack some of the modules.
+            maps = {
+                "remote": self._acquirer.remote_device.node_map,
+                "interface": _map_of(self._acquirer.interface),
+                "device": _map_of(self._acquirer.device),
+                "stream": _map_of(streams[0]) if streams else None,
+                "system": _map_of(self._acquirer.system),
+            }
+            self._features = {
+                name: GenapiFeatures(found) for name, found in maps.items() if found is not None
+            }
             apply_settings(spec.settings, self._features)
             # After the settings: they may have changed width, height and pixel format.
             check_format(frame_format(self._features), spec)
@@ -325,19 +336,6 @@ class _Library:
 
     def __exit__(self, *_: object) -> None:
         self.close()
-
-
-def _modules(acquirer: Any) -> dict[str, GenapiFeatures]:
-    """Return the node maps of a camera; producers may lack some of them."""
-    streams: Sequence[Any] = acquirer.data_streams
-    maps = {
-        "remote": acquirer.remote_device.node_map,
-        "interface": _map_of(acquirer.interface),
-        "device": _map_of(acquirer.device),
-        "stream": _map_of(streams[0]) if streams else None,
-        "system": _map_of(acquirer.system),
-    }
-    return {name: GenapiFeatures(node_map) for name, node_map in maps.items() if node_map is not None}
 
 
 def _map_of(module: Any) -> Any:

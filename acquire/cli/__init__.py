@@ -40,7 +40,14 @@ def __getattr__(name: str) -> Any:
 
 def main() -> int:
     """Run the command line and return the exit code defined in `acquire.errors`."""
-    _open_closed_streams()
+    # If a standard stream is missing, the next file to be opened, such as a recording's, would get the
+    # descriptor to which every library prints.
+    for fd, name in enumerate(("stdin", "stdout", "stderr")):
+        if getattr(sys, name) is None:
+            # It gets the lowest free descriptor: this one, unless something has been opened as it already.
+            nowhere = os.open(os.devnull, os.O_RDWR)
+            os.set_inheritable(nowhere, True)  # child processes need the streams, too
+            setattr(sys, name, os.fdopen(nowhere, "w" if fd else "r", encoding="utf-8"))
     code = _carry_out()
     # Otherwise the interpreter would try to write the rest at exit, fail, and change the exit code.
     _is_full(sys.stderr)
@@ -67,21 +74,6 @@ def _carry_out() -> int:
     # Without a message: `interrupts_handled` has acknowledged it.
     except KeyboardInterrupt:
         return EXIT_INTERRUPTED
-
-
-def _open_closed_streams() -> None:
-    """Open /dev/null as each of stdin, stdout and stderr with which this process was not started.
-
-    Python has no stream for them, and the next file to be opened, such as a recording's, would get the
-    descriptor to which every library prints.
-    """
-    for fd, name in enumerate(("stdin", "stdout", "stderr")):
-        if getattr(sys, name) is not None:
-            continue
-        # It gets the lowest free descriptor: this one, unless something has been opened as it already.
-        nowhere = os.open(os.devnull, os.O_RDWR)
-        os.set_inheritable(nowhere, True)  # child processes need the streams, too
-        setattr(sys, name, os.fdopen(nowhere, "w" if fd else "r", encoding="utf-8"))
 
 
 def _is_full(stream: TextIO) -> bool:

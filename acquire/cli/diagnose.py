@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
@@ -10,9 +10,6 @@ from acquire.cli.output import JsonFlag, print_facts, print_json, print_table, s
 from acquire.cli.recordings import PlaceArgument
 from acquire.cli.stretch import FromOption, ToOption, lines_between
 from acquire.cli.tiles import TileOption, tile_of
-
-if TYPE_CHECKING:
-    from acquire.recon.diagnosis import Diagnosis
 
 WRONG = 1
 """Exit code if the lines contradict the recording's description."""
@@ -70,30 +67,27 @@ def diagnose(
         facts = {"recording": str(opened), "first_line": first, "lines": count, **whose}
         print_json(facts | found.to_dict())
     else:
-        _print(found, first, count, whose)
+        print_facts(
+            {
+                "lines": f"{first} to {first + count - 1}",
+                **whose,
+                "verdict": f"{found.standing}: {found.sentence}",
+                **{f"also ({each.kind})": each.words for each in found.suspicions},
+            }
+        )
+        rows = [
+            (
+                # 0: the recording's own description, with which the others are compared.
+                f"{row.likelier:+.0f}" if row.likelier else "0",
+                f"{row.errors:+.1f}" if row.likelier else "",
+                f"{row.agreement:.1f}" if row.agreement else "",
+                row.name,
+            )
+            for row in found.rows
+        ]
+        if rows:
+            say()
+            print_table(("log likelihood", "std errors", "agreement", "hypothesis"), rows)
     if found.wrong:
         # Without a message: the verdict has been printed.
         raise typer.Exit(WRONG)
-
-
-def _print(found: Diagnosis, first: int, count: int, whose: dict[str, str]) -> None:
-    facts = {
-        "lines": f"{first} to {first + count - 1}",
-        **whose,
-        "verdict": f"{found.standing}: {found.sentence}",
-    }
-    print_facts(facts | {f"also ({each.kind})": each.words for each in found.suspicions})
-    if not found.rows:
-        return
-    say()
-    rows = [
-        (
-            # 0: the recording's own description, with which the others are compared.
-            f"{row.likelier:+.0f}" if row.likelier else "0",
-            f"{row.errors:+.1f}" if row.likelier else "",
-            f"{row.agreement:.1f}" if row.agreement else "",
-            row.name,
-        )
-        for row in found.rows
-    ]
-    print_table(("log likelihood", "std errors", "agreement", "hypothesis"), rows)

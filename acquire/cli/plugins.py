@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-from typing import Any
 
 import typer
 
@@ -27,7 +26,28 @@ def plugins(json: JsonFlag = False) -> None:
 
     Example: [bold]acquire plugins[/]
     """
-    rows = _rows()
+    from acquire.plugins import GROUPS, OURS, described
+
+    rows = []
+    for group in GROUPS:
+        for plugin in group.found():
+            error = why = group.trouble(plugin)
+            # One of our own plug-ins that lacks a package can name the extra that installs it.
+            if plugin.distribution == OURS and (missing := _MISSING.search(error)):
+                lacking = not_installed(ModuleNotFoundError(name=missing[1]))
+                why = f"{missing[1]} is not installed; try: {lacking.hint}"
+            rows.append(
+                {
+                    "kind": group.what,
+                    "group": group.name,
+                    "name": plugin.name,
+                    "distribution": plugin.distribution,
+                    "version": plugin.version,
+                    "works": not error,
+                    "error": why,
+                    "about": "" if error else described(group.load(plugin.name)),
+                }
+            )
     if json:
         print_json(rows)
         return
@@ -37,29 +57,3 @@ def plugins(json: JsonFlag = False) -> None:
     for row in rows:
         if row["error"]:
             say(f"{row['kind']} {row['name']} of {row['distribution']} {row['version']}: {row['error']}")
-
-
-def _rows() -> list[dict[str, Any]]:
-    from acquire.plugins import GROUPS, OURS, described
-
-    rows = []
-    for group in GROUPS:
-        for plugin in group.found():
-            error = shown = group.trouble(plugin)
-            # One of our own plug-ins that lacks a package can name the extra that installs it.
-            if plugin.distribution == OURS and (missing := _MISSING.search(error)):
-                lacking = not_installed(ModuleNotFoundError(name=missing[1]))
-                shown = f"{missing[1]} is not installed; try: {lacking.hint}"
-            rows.append(
-                {
-                    "kind": group.what,
-                    "group": group.name,
-                    "name": plugin.name,
-                    "distribution": plugin.distribution,
-                    "version": plugin.version,
-                    "works": not error,
-                    "error": shown,
-                    "about": "" if error else described(group.load(plugin.name)),
-                }
-            )
-    return rows

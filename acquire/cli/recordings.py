@@ -20,7 +20,6 @@ from acquire.errors import AcquireError, DataError, UsageError
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
-    from acquire.lines import Segment
     from acquire.store import Mirrored, Outline
 
 PlaceArgument = Annotated[
@@ -266,9 +265,13 @@ def cut(
     Example: [bold]acquire cut run.zarr --first-line 2000 --lines 256 --out segment.npz[/], or
     [bold]acquire cut run.zarr --from 52ms --to 60ms --out segment.npz[/]
     """
+    import numpy as np
+
     from acquire.lines import merged
     from acquire.store import open_recording
+    from acquire.store.delivery import whole_file
     from acquire.store.files import check_new_path
+    from acquire.store.refusals import refused
 
     # Now, and not only when it is written: reading and merging may take minutes.
     check_new_path(out)
@@ -279,7 +282,25 @@ def cut(
     count = opened.first_line + opened.lines - first if count is None else count
     with stage_progress(f"cutting {count} lines"):
         segment = opened.cut(first, count, tile_of(opened, tile))
-        size = _save(segment if merge == 1 else merged(segment, merge), out)
+        if merge != 1:
+            segment = merged(segment, merge)
+        # As an open file: NumPy would add .npz to the name of the unfinished one.
+        with whole_file(out) as part, refused(out, "written"), part.open("wb") as file:
+            np.savez(
+                file,
+                lines=segment.lines,
+                mask=segment.mask,
+                code=segment.code,
+                time_ns=segment.time_ns,
+                stages=segment.geometry.stages,
+                substeps=segment.geometry.substeps,
+                first_line=segment.first_line,
+                first_column=segment.first_column,
+                substep_ns=segment.substep_ns,
+                black_level_dn=segment.black_level_dn,
+                responsivity_dn=segment.responsivity_dn,
+            )
+        size = out.stat().st_size
     facts = {"path": str(out), "first_line": first, "lines": count, "bytes": size}
     if json:
         print_json(facts)
@@ -341,29 +362,3 @@ def _damage(recording: Outline) -> str | None:
         return None  # the check would cost a request to the remote store for every file
     found = first_shortfall(recording)
     return next(missing_segments(recording), None) if found is None else str(found)
-
-
-def _save(segment: Segment, out: Path) -> int:
-    """Write the segment, completely or not at all; return the size of the file."""
-    import numpy as np
-
-    from acquire.store.delivery import whole_file
-    from acquire.store.refusals import refused
-
-    # As an open file: NumPy would add .npz to the name of the unfinished one.
-    with whole_file(out) as part, refused(out, "written"), part.open("wb") as file:
-        np.savez(
-            file,
-            lines=segment.lines,
-            mask=segment.mask,
-            code=segment.code,
-            time_ns=segment.time_ns,
-            stages=segment.geometry.stages,
-            substeps=segment.geometry.substeps,
-            first_line=segment.first_line,
-            first_column=segment.first_column,
-            substep_ns=segment.substep_ns,
-            black_level_dn=segment.black_level_dn,
-            responsivity_dn=segment.responsivity_dn,
-        )
-    return out.stat().st_size

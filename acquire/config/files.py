@@ -95,7 +95,12 @@ def load_rig(
     path = find(name, kind="rig")
     table = _read(path)
     _check_kind(table, "rig", path)
-    for dotted, value in _pairs(overrides):
+    given: object = {} if overrides is None else overrides
+    if not (isinstance(given, Mapping) and all(isinstance(key, str) for key in given)):
+        raise ConfigError(
+            f"{shown(given)} cannot override a rig file", possible="{'simulation.speed': 10}, dotted keys"
+        )
+    for dotted, value in given.items():
         *parents, last = dotted.split(".")
         inner = table
         for key in parents:
@@ -116,17 +121,6 @@ def load_rig(
     scene_path = find(scene, beside=path, kind="scene").resolve()
     simulation = rig.simulation.model_copy(update={"scene": str(scene_path)})
     return rig.model_copy(update={"simulation": simulation})
-
-
-def _pairs(overrides: object) -> list[tuple[str, Any]]:
-    """Return overrides as pairs. Raises ConfigError for anything but texts and their values."""
-    if overrides is None:
-        return []
-    if not (isinstance(overrides, Mapping) and all(isinstance(key, str) for key in overrides)):
-        raise ConfigError(
-            f"{shown(overrides)} cannot override a rig file", possible="{'simulation.speed': 10}, dotted keys"
-        )
-    return list(overrides.items())
 
 
 def check_directory(rig: RigConfig) -> None:

@@ -20,7 +20,17 @@ MOST_LISTED = 20
 
 def explained(error: ValidationError, model: type[BaseModel], path: Path | str) -> str:
     """Return one line per finding, with its key, its value, the reason and what is allowed."""
-    findings = _without_consequences(error.errors())
+    found: list[Any] = list(error.errors())
+    places = [item["loc"] for item in found]
+    # Without lists that are too short only because pydantic did not count their invalid items.
+    findings = [
+        item
+        for item in found
+        if item["type"] != "too_short"
+        or not any(
+            len(place) > len(item["loc"]) and place[: len(item["loc"])] == item["loc"] for place in places
+        )
+    ]
     lines = [f"{path}: {len(findings)} error(s)"]
     for item in findings[:MOST_LISTED]:
         keys, allowed, secret = _locate(model, item["loc"])
@@ -39,19 +49,6 @@ def explained(error: ValidationError, model: type[BaseModel], path: Path | str) 
     if len(findings) > MOST_LISTED:
         lines.append(f"  and {len(findings) - MOST_LISTED} more")
     return "\n".join(lines)
-
-
-def _without_consequences(findings: list[Any]) -> list[Any]:
-    """Leave out that a list is too short, if only because pydantic did not count its invalid items."""
-    places = [item["loc"] for item in findings]
-    return [
-        item
-        for item in findings
-        if item["type"] != "too_short"
-        or not any(
-            len(place) > len(item["loc"]) and place[: len(item["loc"])] == item["loc"] for place in places
-        )
-    ]
 
 
 def _locate(model: type[BaseModel], location: tuple[int | str, ...]) -> tuple[list[str], list[str], bool]:

@@ -65,7 +65,12 @@ def examine(rig: RigConfig | None, running: str | None) -> Iterator[Finding]:
     yield _foreign_package()
     yield _plugins()
     yield _descriptors()
-    yield _processors()
+    cores = usable_cores()
+    if cores >= 4:
+        yield Finding("processors", "good", f"{cores} can be used")
+    else:
+        text, todo = f"{cores} can be used: enough to simulate", "four or more for two cameras"
+        yield Finding("processors", "warning", text, todo)
     yield _governor()
     yield _realtime(rig)
     yield _memory(rig)
@@ -75,7 +80,13 @@ def examine(rig: RigConfig | None, running: str | None) -> Iterator[Finding]:
     yield from _usb(rig)
     yield from _producers(rig)
     yield from _port(rig)
-    yield _daemon(running)
+    if running is None:
+        yield Finding("daemon", "good", "none is running")
+    elif running != __version__:
+        text = f"the one that runs is acquire {running}, and this is {__version__}"
+        yield Finding("daemon", "warning", text, "restart it")
+    else:
+        yield Finding("daemon", "good", f"acquire {running} is running")
 
 
 def _foreign_package() -> Finding:
@@ -114,15 +125,6 @@ def _descriptors() -> Finding:
         "warning",
         f"a process may have only {hard}",
         "LimitNOFILE=65536 in the unit, or nofile in /etc/security/limits.d/",
-    )
-
-
-def _processors() -> Finding:
-    cores = usable_cores()
-    if cores >= 4:
-        return Finding("processors", "good", f"{cores} can be used")
-    return Finding(
-        "processors", "warning", f"{cores} can be used: enough to simulate", "four or more for two cameras"
     )
 
 
@@ -295,15 +297,6 @@ def _port(rig: RigConfig | None) -> Iterator[Finding]:
         yield Finding("page", "warning", text, "another web.port, unless it is the page that is running")
         return
     yield Finding("page", "good", f"{rig.web.host}:{rig.web.port} is free")
-
-
-def _daemon(running: str | None) -> Finding:
-    if running is None:
-        return Finding("daemon", "good", "none is running")
-    if running != __version__:
-        text = f"the one that runs is acquire {running}, and this is {__version__}"
-        return Finding("daemon", "warning", text, "restart it")
-    return Finding("daemon", "good", f"acquire {running} is running")
 
 
 def _read(path: Path) -> str:

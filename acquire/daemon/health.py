@@ -55,7 +55,17 @@ def _of_arms(status: Status, line_rate_hz: float, age_s: float) -> list[HealthCh
         found += [_ring(name, arm, status.state), _saturation(name, arm), _code(name, arm)]
         # A rate over five seconds is too low until these have passed.
         if age_s > SETTLED_S:
-            found.append(_rate(name, arm, line_rate_hz))
+            slow = arm.rate_hz < line_rate_hz * (1 - RATE_TOLERANCE)
+            found.append(
+                HealthCheck(
+                    name=f"rate {name}",
+                    level="warning" if slow else "good",
+                    text=f"arm {name} delivers {arm.rate_hz:.0f} lines/s of {line_rate_hz:.0f}",
+                    value=round(arm.rate_hz, 1),
+                    unit="1/s",
+                    limit=f"good from {1 - RATE_TOLERANCE:.0%} of the configured rate on",
+                )
+            )
         if arm.ledger is not None and not arm.ledger.balanced:
             found.append(
                 HealthCheck(name=f"ledger {name}", level="bad", text=f"ledger {name} does not balance")
@@ -101,18 +111,6 @@ def _code(name: str, arm: ArmStatus) -> HealthCheck:
         level=level,
         text=f"the light's code in arm {name} is {verdict}",
         value=check.shift,
-    )
-
-
-def _rate(name: str, arm: ArmStatus, line_rate_hz: float) -> HealthCheck:
-    slow = arm.rate_hz < line_rate_hz * (1 - RATE_TOLERANCE)
-    return HealthCheck(
-        name=f"rate {name}",
-        level="warning" if slow else "good",
-        text=f"arm {name} delivers {arm.rate_hz:.0f} lines/s of {line_rate_hz:.0f}",
-        value=round(arm.rate_hz, 1),
-        unit="1/s",
-        limit=f"good from {1 - RATE_TOLERANCE:.0%} of the configured rate on",
     )
 
 

@@ -35,7 +35,23 @@ _CGROUP_LIMIT = Path("/sys/fs/cgroup/memory.max")
 def check_host(config: RigConfig) -> None:
     """Raise ConfigError if the rig cannot be recorded on this host, stating what could be."""
     check_directory(config)
-    _check_disk(config)
+    recording = config.recording
+    total_gb = shutil.disk_usage(recording.directory).total / 1e9
+    if recording.reserve_gb >= total_gb:
+        raise ConfigError(
+            f"recording.reserve_gb = {recording.reserve_gb:g}: the disk of {recording.directory.absolute()} "
+            f"has {total_gb:.3g} GB in all",
+            possible=f"below {total_gb:.3g}",
+        )
+    retention = recording.retention
+    line_bytes = config.pixels * np.dtype(config.cameras.a.dtype).itemsize
+    shard_gb = len(ARMS) * config.chunk_lines * recording.shard_chunks * line_bytes / 1e9
+    if retention is not None and retention.max_gb is not None and retention.max_gb < shard_gb:
+        raise ConfigError(
+            f"recording.retention.max_gb = {retention.max_gb:g} is less than one file of each arm",
+            possible=f"{shard_gb:.3g} or more",
+            hint="a smaller recording.shard_chunks makes smaller files",
+        )
     _check_spec(config)
     rings, scene = needed_bytes(config)
     most = int(MEMORY_PART * memory_bytes())
@@ -79,26 +95,6 @@ def _check_spec(config: RigConfig) -> None:
         raise ConfigError(
             f"[recording]: {error.message}", possible=error.possible, hint=error.hint
         ) from error
-
-
-def _check_disk(config: RigConfig) -> None:
-    recording = config.recording
-    total_gb = shutil.disk_usage(recording.directory).total / 1e9
-    if recording.reserve_gb >= total_gb:
-        raise ConfigError(
-            f"recording.reserve_gb = {recording.reserve_gb:g}: the disk of {recording.directory.absolute()} "
-            f"has {total_gb:.3g} GB in all",
-            possible=f"below {total_gb:.3g}",
-        )
-    retention = recording.retention
-    line_bytes = config.pixels * np.dtype(config.cameras.a.dtype).itemsize
-    shard_gb = len(ARMS) * config.chunk_lines * recording.shard_chunks * line_bytes / 1e9
-    if retention is not None and retention.max_gb is not None and retention.max_gb < shard_gb:
-        raise ConfigError(
-            f"recording.retention.max_gb = {retention.max_gb:g} is less than one file of each arm",
-            possible=f"{shard_gb:.3g} or more",
-            hint="a smaller recording.shard_chunks makes smaller files",
-        )
 
 
 def needed_bytes(config: RigConfig) -> tuple[int, int]:

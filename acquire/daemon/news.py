@@ -140,7 +140,13 @@ class Changes:
         new = [one for one in status.troubles if one.times > known.get(one.text, 0)]
         troubles = [_fact("trouble", one.text, "error") for one in new]
         found += self._disk_level(status) + troubles
-        return found + _waiting(before, status) + _recoveries(before, status) + _uploads(before, status)
+        # Only the beginning and the end of a wait are news: its text changes every second.
+        waited = bool(before and before.waiting)
+        if status.waiting and not waited:
+            found.append(_fact("waiting", status.waiting, "warning"))
+        elif waited and not status.waiting:
+            found.append(_fact("waiting", "the wait is over"))
+        return found + _recoveries(before, status) + _uploads(before, status)
 
     def _disk_level(self, status: Status) -> list[dict[str, Any]]:
         # Not too often: the estimate jumps when a recording begins.
@@ -172,14 +178,6 @@ def _verdicts(before: Status, after: Status) -> list[dict[str, Any]]:
         text = f"arm {arm}: the light's code is {verdict}{shift}"
         found.append(_fact("verdict", text, level, arm=arm, line=new.checked_line))
     return found
-
-
-def _waiting(before: Status | None, after: Status) -> list[dict[str, Any]]:
-    """Report the beginning and end of a wait, whose text changes every second."""
-    was, now = bool(before and before.waiting), after.waiting
-    if now and not was:
-        return [_fact("waiting", now, "warning")]
-    return [_fact("waiting", "the wait is over")] if was and not now else []
 
 
 def _recoveries(before: Status | None, after: Status) -> list[dict[str, Any]]:

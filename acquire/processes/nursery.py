@@ -169,7 +169,21 @@ class Nursery:
     def fork(self, name: str, target: Callable[..., None], *args: Any) -> Child:
         """Fork a process that calls ``target(*args)``. Raises errors of pickling, and OSError."""
         parcel = _Parcel()
-        job = _pack(parcel, name, target, args)
+        buffer = io.BytesIO()
+        # multiprocessing pickles a pipe or a lock only while it is spawning a process: it then passes
+        # descriptors to `parcel`.
+        set_spawning_popen(parcel)  # type: ignore[arg-type]
+        try:
+            ForkingPickler(buffer, pickle.HIGHEST_PROTOCOL).dump((name, target, args))
+        finally:
+            set_spawning_popen(None)
+        content = buffer.getvalue()
+        here = spawn.get_preparation_data(name)
+        keys = ["sys_path", "sys_argv", "dir"]
+        if b"__main__" in content:  # it needs the owner's main module
+            keys += ["init_main_from_name", "init_main_from_path"]
+        place = {key: here[key] for key in keys if key in here}
+        job = pickle.dumps((place, dict(os.environ), content))
         # The job is sent as an anonymous file, since a plan with its arrays may be larger than a packet,
         # which is limited by the socket's buffer.
         ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
@@ -272,24 +286,6 @@ _received: list[int] = []
 def is_worker() -> bool:
     """Return whether this process is a nursery's worker, whose cores are for the capture path."""
     return bool(_received)
-
-
-def _pack(parcel: _Parcel, name: str, target: Callable[..., None], args: tuple[Any, ...]) -> bytes:
-    buffer = io.BytesIO()
-    # multiprocessing pickles a pipe or a lock only while it is spawning a process: it then passes descriptors
-    # to `parcel`.
-    set_spawning_popen(parcel)  # type: ignore[arg-type]
-    try:
-        ForkingPickler(buffer, pickle.HIGHEST_PROTOCOL).dump((name, target, args))
-    finally:
-        set_spawning_popen(None)
-    job = buffer.getvalue()
-    here = spawn.get_preparation_data(name)
-    keys = ["sys_path", "sys_argv", "dir"]
-    if b"__main__" in job:  # it needs the owner's main module
-        keys += ["init_main_from_name", "init_main_from_path"]
-    place = {key: here[key] for key in keys if key in here}
-    return pickle.dumps((place, dict(os.environ), job))
 
 
 # ---- the nursery's process

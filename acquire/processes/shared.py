@@ -26,7 +26,24 @@ class SharedBytes:
     def __init__(self, name: str, size: int, fd: int | None = None) -> None:
         self.name = name
         self.size = size
-        self._fd = _allocate(name, size) if fd is None else fd
+        if fd is None:
+            if size > (available := available_bytes()):
+                raise DeviceError(
+                    f"{name} needs {size / 2**20:.0f} MiB of shared memory",
+                    possible=f"{available / 2**20:.0f} MiB",
+                    hint="fewer or shorter ring slots, or fewer seconds (stream.ring_slots, ring_seconds)",
+                )
+            fd = os.memfd_create(f"acquire-{name}")
+            try:
+                # Fail now, rather than with SIGBUS at a later store into a page that cannot be allocated.
+                os.posix_fallocate(fd, 0, size)
+            except OSError as error:
+                os.close(fd)
+                raise DeviceError(
+                    f"{name} needs {size / 2**20:.0f} MiB of shared memory: {error.strerror}",
+                    hint="fewer or shorter ring slots",
+                ) from error
+        self._fd = fd
         # Populate now: a page's first touch during capture would cost more than the copy itself.
         self.map = mmap.mmap(self._fd, size, flags=mmap.MAP_SHARED | mmap.MAP_POPULATE)
 
@@ -85,26 +102,6 @@ def available_bytes() -> int:
     with Path("/proc/meminfo").open(encoding="ascii") as lines:
         sizes = dict(line.split(":") for line in lines)
     return int(sizes["MemAvailable"].split()[0]) * 1024
-
-
-def _allocate(name: str, size: int) -> int:
-    if size > (available := available_bytes()):
-        raise DeviceError(
-            f"{name} needs {size / 2**20:.0f} MiB of shared memory",
-            possible=f"{available / 2**20:.0f} MiB",
-            hint="fewer or shorter ring slots, or fewer seconds (stream.ring_slots, ring_seconds)",
-        )
-    fd = os.memfd_create(f"acquire-{name}")
-    try:
-        # Fail now, rather than with SIGBUS at a later store into a page that cannot be allocated.
-        os.posix_fallocate(fd, 0, size)
-    except OSError as error:
-        os.close(fd)
-        raise DeviceError(
-            f"{name} needs {size / 2**20:.0f} MiB of shared memory: {error.strerror}",
-            hint="fewer or shorter ring slots",
-        ) from error
-    return fd
 
 
 def _attach(name: str, size: int, descriptor: Any) -> SharedBytes:

@@ -23,7 +23,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -169,7 +169,15 @@ class Judge:
         seen = np.diff(sight.energy)
         known = np.isfinite(seen)
         contrast = float(steps.std() / max(seen[known].std(), _NEVER_ZERO))
-        found = _read(_correlate(seen, known, steps, self.substeps), nominal, contrast, int(known.sum()))
+        # The correlation of what was seen, one value per line, with the prediction, one per sub-step, at all
+        # delays.
+        spread = np.zeros(self.substeps * len(seen))
+        spread[:: self.substeps] = np.where(known, seen - seen[known].mean(), 0.0)
+        size = _transform_size(len(steps))
+        product = np.conj(np.fft.rfft(spread, size)) * np.fft.rfft(steps, size)
+        raw = np.fft.irfft(product, size)[: len(steps) - len(spread) + 1]
+        deviations = raw / max(seen[known].std() * steps.std() * np.sqrt(known.sum()), _NEVER_ZERO)
+        found = _read(deviations, nominal, contrast, int(known.sum()))
         # Noise in the dark may correlate with anything, but by chance not at the expected delay.
         is_lit = min(light, rows.mean()) >= least
         return found if is_lit or found.verdict is Verdict.VERIFIED else dark
@@ -185,20 +193,6 @@ def predict(rows: NDArray[np.float64], bits: NDArray[np.uint8], substeps: int) -
     product = np.fft.rfft(bits.astype(np.float64), size) * np.conj(np.fft.rfft(response, size))
     energy: NDArray[np.float64] = np.fft.irfft(product, size)[: len(bits) - len(response) + 1]
     return energy
-
-
-def _correlate(
-    seen: NDArray[Any], known: NDArray[np.bool_], steps: NDArray[Any], substeps: int
-) -> NDArray[np.float64]:
-    """Correlate ``seen``, one value per line, with ``steps`` (predicted, one per sub-step) at all delays."""
-    spread = np.zeros(substeps * len(seen))
-    spread[::substeps] = np.where(known, seen - seen[known].mean(), 0.0)
-    size = _transform_size(len(steps))
-    product = np.conj(np.fft.rfft(spread, size)) * np.fft.rfft(steps, size)
-    raw = np.fft.irfft(product, size)[: len(steps) - len(spread) + 1]
-    scale = seen[known].std() * steps.std() * np.sqrt(known.sum())
-    deviations: NDArray[np.float64] = raw / max(scale, _NEVER_ZERO)
-    return deviations
 
 
 def _read(peaks: NDArray[np.float64], nominal: int, contrast: float, lines: int) -> Finding:

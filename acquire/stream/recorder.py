@@ -253,9 +253,14 @@ class Recorder:
     # ---- the disk's answers
 
     def _check_disk(self) -> None:
-        if self._opening is not None and self._opening.writer.done() and self._is_ready_for(self._opening):
-            opening, self._opening = self._opening, None
-            self._opened(opening)
+        opening = self._opening
+        if opening is not None and opening.writer.done():
+            at_once = opening.span is not None or self._state is RecorderState.CANCELLED
+            at_once = at_once or opening.writer.exception() is not None
+            # With a backlog, the rings might overflow as soon as the recording began.
+            if at_once or all(2 * arm.ring.fill < arm.ring.shape.slots for arm in self._arms.values()):
+                self._opening = None
+                self._opened(opening)
         if self._closing is not None and self._closing[1].done():
             (session, sealed), self._closing = self._closing, None
             self._go(RecorderEvent.SEALED)
@@ -269,14 +274,6 @@ class Recorder:
             if self._cut_short and ended.on_disk:
                 ended = replace(ended, end_line=session.end_line)
             self._mailbox.post(ended)
-
-    def _is_ready_for(self, opening: Opening) -> bool:
-        """Return whether the recording may begin: with a backlog, the rings might overflow at once."""
-        if opening.span is not None or self._state is RecorderState.CANCELLED:
-            return True
-        if opening.writer.exception() is not None:
-            return True
-        return all(2 * arm.ring.fill < arm.ring.shape.slots for arm in self._arms.values())
 
     def _forget(self, name: str, lines: int, end_line: int, place: str) -> None:
         """Move ``lines`` taken for the recording, but not part of it, to the count ``place``.
@@ -405,7 +402,14 @@ class Recorder:
             self._cut_short = True
             full = f"the ring of arm {name} was full at line {line}"
             session.cut(line, f"too slow to write: {full}{self._held_up}")
-        self._count_overrun(name, block, session)  # before the book goes past the lines in question
+        # Before the book goes past them: each line that found the ring full, and is a gap in a recording, is
+        # counted once.
+        for loss in block.losses:
+            first = max(loss.first_line, session.books[name].next_line, self._counters[f"overrun_to_{name}"])
+            end = min(loss.end_line, session.end_line)
+            if loss.cause is Cause.RING_FULL and first < end:
+                self._counters.add(f"overrun_{name}", end - first)
+                self._counters[f"overrun_to_{name}"] = end
         with self._waits.loop():
             written = session.take(name, block, hurry=arm.ring.fill > _CALM_BLOCKS)
         if written:
@@ -419,15 +423,6 @@ class Recorder:
             reason = f"too slow to write: {waiting}{self._held_up}"
             session.end(self._common_line(), reason, RunCondition.INTERRUPTED)
         self._hold_ups.took(block.time_ns / 1e9)
-
-    def _count_overrun(self, name: str, block: RingBlock, session: Session) -> None:
-        """Count lines that found the ring full and are a gap in a recording, each of them once."""
-        for loss in block.losses:
-            first = max(loss.first_line, session.books[name].next_line, self._counters[f"overrun_to_{name}"])
-            end = min(loss.end_line, session.end_line)
-            if loss.cause is Cause.RING_FULL and first < end:
-                self._counters.add(f"overrun_{name}", end - first)
-                self._counters[f"overrun_to_{name}"] = end
 
     def _release(self, name: str, arm: Arm) -> None:
         """Release the arm's last block to its ring, once it is written."""

@@ -310,7 +310,16 @@ class Supervisor:
     def _watch(self, now_s: float) -> None:
         """Detect silent arms, which are a fault; during a recording, the recorder judges them."""
         limit_s = self._plan.stall_timeout_s
-        self._wait_for_successors()
+        for name in self._workers:
+            if self._succession.is_late(name):
+                self._fail(f"{self._workers[name].name}: its successor was not ready in time", name)
+            elif self._succession.is_starting(name):
+                # A camera takes seconds to come back. Until then neither its arm, nor the recorder that waits
+                # for it in an open recording, counts as stalled.
+                self._loop.revive()
+                for arm in self._arms_of.get(name, ()):
+                    self._cameras[arm].revive()
+                    self._counters[RECORDER].add(f"awaited_{arm}", 1)
         self._watch_recorder(now_s)
         pulse = self._newest_pulse
         for arm, excess in self._excess.items() if pulse is not None else ():
@@ -343,18 +352,6 @@ class Supervisor:
     def waits_for_disk(self) -> bool:
         """Whether the recorder's loop waits for the disk, and was not stopped by a signal in that wait."""
         return bool(self._counters[RECORDER]["disk_since_ns"]) and not self._workers[RECORDER].is_stopped
-
-    def _wait_for_successors(self) -> None:
-        for name in self._workers:
-            if self._succession.is_late(name):
-                self._fail(f"{self._workers[name].name}: its successor was not ready in time", name)
-            elif self._succession.is_starting(name):
-                # A camera takes seconds to come back. Until then neither its arm, nor the recorder that waits
-                # for it in an open recording, counts as stalled.
-                self._loop.revive()
-                for arm in self._arms_of.get(name, ()):
-                    self._cameras[arm].revive()
-                    self._counters[RECORDER].add(f"awaited_{arm}", 1)
 
     def _read_messages(self, name: str, worker: Worker) -> None:
         death = worker.death  # read before the messages, so that the last message of a dead process is seen

@@ -74,10 +74,18 @@ def protocol_markdown() -> str:
         "flags": TagFlag,
         "errors": ErrorCode,
     }
+    tables: dict[str, str] = {}
+    for name, kind in kinds.items():
+        # From the source, since Python does not keep the texts below the members of an enumeration.
+        texts = re.findall(r"^    (\w+) = .*\n    \"\"\"(.*?)\"\"\"", inspect.getsource(kind), re.MULTILINE)
+        docs = dict(texts)
+        form = "0x{:02x}" if kind is FrameType else "{}"  # types in hexadecimal: their bits have a meaning
+        rows = [f"| {form.format(int(item))} | {item.name} | {docs[str(item.name)]} |\n" for item in kind]
+        tables[name] = "| value | name | |\n|---|---|---|\n" + "".join(rows)
     starts = accumulate((bits // 8 for _, bits in TAG_FIELDS), initial=0)
     fields = zip(TAG_FIELDS, starts, strict=False)  # the last start is the end
     return PROTOCOL.substitute(
-        {name: _enum_table(kind) for name, kind in kinds.items()},
+        tables,
         note=_NOTE,
         version=registers.PROTOCOL_VERSION,
         max_payload=registers.MAX_PAYLOAD,
@@ -103,12 +111,3 @@ def _rows(register: Register) -> Iterator[str]:
         top = field.low + field.width - 1
         bits = str(field.low) if field.width == 1 else f"{top}:{field.low}"
         yield f"| | .{field.name} | {bits} | | | {field.doc} |"
-
-
-def _enum_table(kind: type[IntEnum | IntFlag]) -> str:
-    # From the source, since Python does not keep the texts below the members of an enumeration.
-    found = re.findall(r"^    (\w+) = .*\n    \"\"\"(.*?)\"\"\"", inspect.getsource(kind), re.MULTILINE)
-    docs = dict(found)
-    form = "0x{:02x}" if kind is FrameType else "{}"  # types in hexadecimal, since their bits have a meaning
-    rows = [f"| {form.format(int(item))} | {item.name} | {docs[str(item.name)]} |\n" for item in kind]
-    return "| value | name | |\n|---|---|---|\n" + "".join(rows)

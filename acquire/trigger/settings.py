@@ -124,7 +124,13 @@ def register_values(
     distance = run.substep_ticks if config.line_start == "per-substep" else run.line_period_ticks
     _check_timing(run, config, device, distance)
     _check_tags(run, device, bytes_per_s)
-    _check_watchdog(config)
+    most = (1 << r.WATCHDOG.width) - 1
+    if config.watchdog_ticks > most:
+        raise TriggerError(
+            f"the watchdog cannot wait for {config.watchdog_s:g} s",
+            possible=f"up to {most / config.clock_hz:.4g} s at {config.clock_hz} Hz; 0: never",
+            hint="change trigger.watchdog_s",
+        )
     return {
         **_code(run.code.to_attrs(), device),
         r.SUBSTEP_CLOCKS: run.substep_ticks,
@@ -210,16 +216,6 @@ def _check_tags(run: TriggerRun, device: Capabilities, bytes_per_s: float) -> No
             f"the link cannot carry a tag every {run.tag_every_lines} lines at {line_rate:g} lines/s",
             possible=f"every {fewest} lines over a link of {bytes_per_s:g} bytes/s",
             hint="raise trigger.tag_every_lines or trigger.baud",
-        )
-
-
-def _check_watchdog(config: TriggerConfig) -> None:
-    most = (1 << r.WATCHDOG.width) - 1
-    if config.watchdog_ticks > most:
-        raise TriggerError(
-            f"the watchdog cannot wait for {config.watchdog_s:g} s",
-            possible=f"up to {most / config.clock_hz:.4g} s at {config.clock_hz} Hz; 0: never",
-            hint="change trigger.watchdog_s",
         )
 
 

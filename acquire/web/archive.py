@@ -185,7 +185,10 @@ class Archive:
             known = self._kinds.get(path.name)
             # A page asks for both lists every three seconds, and there may be thousands of entries.
             if known is None or known[0] != stamp or stamp is None:
-                known = stamp, _is_video(path)
+                try:
+                    known = stamp, (format_of(path) or "").startswith(VIDEO)
+                except AcquireError:
+                    known = stamp, False  # it is then listed among the recordings, with the error
             kinds[path.name] = known
             if known[1] is video:
                 found.append((mode.st_mtime_ns, path))
@@ -223,13 +226,6 @@ def _remember(cache: OrderedDict[Any, Any], key: Any, value: Any, most: int) -> 
     cache[key] = value
     while len(cache) > most:
         cache.popitem(last=False)
-
-
-def _is_video(path: Path) -> bool:
-    try:
-        return (format_of(path) or "").startswith(VIDEO)
-    except AcquireError:
-        return False  # it is then listed among the recordings, with the error
 
 
 def _facts(path: Path, opened: Recording) -> RecordingFacts:

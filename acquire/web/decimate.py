@@ -131,7 +131,12 @@ class Decimator:
         """
         self._lost |= lost
         usable = (flags & NO_IMAGE) == 0
-        for start, stop in _stretches(usable):
+        if usable.all():  # as most blocks are, and the other way takes ten times as long
+            stretches = [[0, len(usable)]]
+        else:
+            ends = np.flatnonzero(np.diff(usable, prepend=False, append=False))
+            stretches = ends.reshape(-1, 2).tolist()
+        for start, stop in stretches:
             begin, end = first_line + start, first_line + stop
             # What waits belongs before the gap: rows are added in order only.
             if self._next_line is not None and begin > self._next_line:
@@ -169,7 +174,11 @@ class Decimator:
         lines = np.concatenate([lines for lines, _ in self._waiting])
         sampled = np.concatenate([pixels for _, pixels in self._waiting])
         self._waiting.clear()
-        self._count(sampled[lines // self._scale.stride % self._scale.counted == 0])
+        # First by value and then by bin, because there are few values and many pixels.
+        white, counted = self._scale.white_dn, lines // self._scale.stride % self._scale.counted == 0
+        values = np.bincount(sampled[counted].ravel(), minlength=white + 1)[: white + 1]
+        self._histogram += np.bincount(self._bins, values, BINS).astype(np.int64)
+        self._saturated += int(values[white])
         rows = lines // self._scale.step
         begins = np.flatnonzero(np.diff(rows, prepend=rows[0] - 1))
         members = _members(begins, np.append(begins[1:], len(rows)))
@@ -178,13 +187,6 @@ class Decimator:
             row = self._begin(int(number))  # an earlier call may have begun this row
             row.low = row_low if row.low is None else np.minimum(row.low, row_low)
             row.high = row_high if row.high is None else np.maximum(row.high, row_high)
-
-    def _count(self, pixels: NDArray[Any]) -> None:
-        # First by value and then by bin, because there are few values and many pixels.
-        white = self._scale.white_dn
-        values = np.bincount(pixels.ravel(), minlength=white + 1)[: white + 1]
-        self._histogram += np.bincount(self._bins, values, BINS).astype(np.int64)
-        self._saturated += int(values[white])
 
     def _extremes(self, sampled: NDArray[Any], members: NDArray[np.intp], extreme: np.ufunc) -> NDArray[Any]:
         """Return the extremes (row, column); ``members`` (line, row) are the lines of each row."""
@@ -233,16 +235,6 @@ class Decimator:
             first = last - MOST_UNSEEN_ROWS + 1
         for number in range(first, last + 1):
             self._begin(number).kind = kind
-
-
-def _stretches(usable: NDArray[np.bool_]) -> list[list[int]]:
-    """Return the beginning and end of each stretch that is usable."""
-    if usable.all():  # as most blocks are, and the other way takes ten times as long
-        return [[0, len(usable)]]
-    ends: list[list[int]] = (
-        np.flatnonzero(np.diff(usable, prepend=False, append=False)).reshape(-1, 2).tolist()
-    )
-    return ends
 
 
 def _members(begins: NDArray[np.intp], ends: NDArray[np.intp]) -> NDArray[np.intp]:

@@ -54,7 +54,19 @@ def serve_page(socket: Path, directory: Path, config: WebConfig) -> None:
                 f"web.certificate {config.certificate} and its key cannot be used: {error}",
                 possible="PEM files",
             ) from error
-    with contextlib.closing(_listen(config)) as listener:
+    family = sockets.AF_INET6 if ":" in config.host else sockets.AF_INET
+    with contextlib.closing(sockets.socket(family, sockets.SOCK_STREAM)) as listener:
+        # Otherwise a page that is restarted would have to wait for old connections to time out.
+        listener.setsockopt(sockets.SOL_SOCKET, sockets.SO_REUSEADDR, 1)
+        try:
+            listener.bind((config.host, config.port))
+            listener.listen(128)
+        except (OSError, UnicodeError) as error:
+            why = error.strerror if isinstance(error, OSError) else "no such host"
+            raise UsageError(
+                f"the page cannot listen on {config.host}:{config.port}: {why}",
+                hint="choose another web.port, or 0 for any free port",
+            ) from error
         log.info("the operator's page: %s (the token: acquire web --link)", address_of(config, listener))
         asyncio.run(_serve(socket, directory, tokens, config, listener, context))
 
@@ -143,21 +155,3 @@ def directory_of(socket: Path) -> Path:
     if disk is None:
         raise NoDaemonError("the daemon has not checked its disk yet", hint="again in a moment")
     return Directory(disk.directory)
-
-
-def _listen(config: WebConfig) -> sockets.socket:
-    family = sockets.AF_INET6 if ":" in config.host else sockets.AF_INET
-    listener = sockets.socket(family, sockets.SOCK_STREAM)
-    # Otherwise a page that is restarted would have to wait for old connections to time out.
-    listener.setsockopt(sockets.SOL_SOCKET, sockets.SO_REUSEADDR, 1)
-    try:
-        listener.bind((config.host, config.port))
-        listener.listen(128)
-    except (OSError, UnicodeError) as error:
-        listener.close()
-        why = error.strerror if isinstance(error, OSError) else "no such host"
-        raise UsageError(
-            f"the page cannot listen on {config.host}:{config.port}: {why}",
-            hint="choose another web.port, or 0 for any free port",
-        ) from error
-    return listener

@@ -90,17 +90,14 @@ class TokenFile:
             self._looked_s = now_s
             stamp = _stamp(self._path)
             if stamp is None or stamp != self._stamp:
-                self._renew()
+                try:
+                    self._tokens = load_tokens(self._path)
+                except UsageError as error:
+                    log.warning("%s; the tokens from before stay valid", error)
+                else:
+                    log.info("the tokens were changed: %s", self._path)
+                self._stamp = _stamp(self._path)
         return self._tokens
-
-    def _renew(self) -> None:
-        try:
-            self._tokens = load_tokens(self._path)
-        except UsageError as error:
-            log.warning("%s; the tokens from before stay valid", error)
-        else:
-            log.info("the tokens were changed: %s", self._path)
-        self._stamp = _stamp(self._path)
 
 
 def _stamp(path: Path) -> tuple[int, int] | None:

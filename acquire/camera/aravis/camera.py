@@ -80,8 +80,12 @@ class AravisCamera:
             self._device = library.arv_camera_get_device(self._camera)
             if library.arv_camera_is_gv_device(self._camera):
                 library.arv_camera_gv_set_stream_options(self._camera, _NO_PACKET_SOCKET)
-            self._features = AravisFeatures(library, self._device)
-            self._identity = _identify(self._features)
+            self._features = features = AravisFeatures(library, self._device)
+            # Older cameras have the serial number as DeviceID.
+            serial = _text(features, "DeviceSerialNumber") or _text(features, "DeviceID")
+            firmware = _text(features, "DeviceFirmwareVersion") or _text(features, "DeviceVersion")
+            vendor, model = _text(features, "DeviceVendorName"), _text(features, "DeviceModelName")
+            self._identity = CameraIdentity(vendor, model, serial, firmware)
             _check_identity(self._identity, spec)
             self._parameters = StreamParameters(library, self._device, self._prepare, self._drop)
             apply_settings(spec.settings, self.features())
@@ -125,9 +129,16 @@ class AravisCamera:
         what = f"arm camera {self._spec.serial}"
         with errors(what) as error:
             self._payload = library.arv_camera_get_payload(self._camera, error)
-        bits, skips_zero = self._frame_ids()
+        # USB3 Vision has frame IDs of 64 bits that do not skip 0; in GigE Vision they skip it.
+        bits, skips_zero = 64, False
+        if not library.arv_camera_is_uv_device(self._camera):
+            # An option of GigE Vision 2, which a camera may have switched off, or not have at all.
+            mode = self._features.find("GevGVSPExtendedIDMode")
+            extended = mode is not None and mode.readable and mode.read() == "On"
+            bits, skips_zero = 64 if extended else 16, True
+        spec = replace(self._spec, frame_id_bits=self._spec.frame_id_bits or bits)
         buffers = buffer_count(self._spec, found)
-        self._assembly = Assembly(found, replace(self._spec, frame_id_bits=bits), buffers, skips_zero)
+        self._assembly = Assembly(found, spec, buffers, skips_zero)
         self._packets = 1
         if library.arv_camera_is_gv_device(self._camera):
             with errors(what) as error:
@@ -144,15 +155,6 @@ class AravisCamera:
         with errors(what) as error:
             library.arv_camera_start_acquisition(self._camera, error)
         self._heard_s = time.monotonic()
-
-    def _frame_ids(self) -> tuple[int, bool | None]:
-        """Return the bits of frame IDs, and whether they skip 0, as in GigE Vision and USB3 Vision."""
-        if self._library.arv_camera_is_uv_device(self._camera):
-            return self._spec.frame_id_bits or 64, False
-        # An option of GigE Vision 2, which a camera may have switched off, or not have at all.
-        mode = self._features.find("GevGVSPExtendedIDMode")
-        extended = mode is not None and mode.readable and mode.read() == "On"
-        return self._spec.frame_id_bits or (64 if extended else 16), True
 
     def _give(self, stream: int, buffer: int) -> None:
         """Queue a buffer for Aravis to fill."""
@@ -303,15 +305,6 @@ def _find(library: Any, spec: GenicamSpec) -> bytes:
         )
     device_id: bytes = library.arv_get_device_id(found[spec.serial])
     return device_id
-
-
-def _identify(features: AravisFeatures) -> CameraIdentity:
-    """Return the identity from the camera's features; older cameras have the serial number as DeviceID."""
-    serial = _text(features, "DeviceSerialNumber") or _text(features, "DeviceID")
-    firmware = _text(features, "DeviceFirmwareVersion") or _text(features, "DeviceVersion")
-    return CameraIdentity(
-        _text(features, "DeviceVendorName"), _text(features, "DeviceModelName"), serial, firmware
-    )
 
 
 def _text(features: AravisFeatures, name: str) -> str:

@@ -171,16 +171,15 @@ class AravisNode:
             low, high = (
                 (c_int64(-(2**63)), c_int64(2**63 - 1)) if whole else (c_double(-_MOST), c_double(_MOST))
             )
-        return low.value, high.value, self._step() if whole else 0
-
-    def _step(self) -> int:
-        try:
-            with errors(self.name) as error:
-                # A masked register has no increment, and can be written nevertheless.
-                step = self._library.arv_device_get_integer_feature_increment(self._device, self._key, error)
-        except CameraError:
-            return 1
-        return int(step)
+        step = 0
+        if whole:
+            try:
+                with errors(self.name) as error:
+                    increment = self._library.arv_device_get_integer_feature_increment
+                    step = int(increment(self._device, self._key, error))
+            except CameraError:
+                step = 1  # a masked register has no increment, and can be written nevertheless
+        return low.value, high.value, step
 
     def entries(self) -> list[str]:
         count = c_uint()

@@ -62,7 +62,17 @@ class SerialTransport:
         # SerialException is an OSError; termios.error, of a port that vanishes while it is set up, is not
         except (OSError, ValueError, termios.error) as error:
             self._lock.release()
-            raise _not_opened(url, error, local) from error
+            # The advice depends on the cause: no permission, a wrong address, or a port that is missing.
+            if getattr(error, "errno", None) in (errno.EACCES, errno.EPERM):
+                raise TriggerError(f"{url} may not be opened: permission denied", hint=UDEV_HINT) from error
+            if not local:
+                hint = "check the address"
+                raise TriggerError(f"{url} cannot be opened: {error}", hint=hint) from error
+            ports = ", ".join(sorted(port.device for port in comports()))
+            what = "is not there" if not Path(url).exists() else f"cannot be opened: {error}"
+            raise TriggerError(
+                f"{url} {what}", possible=ports or "no serial port", hint="check cable and power"
+            ) from error
 
     def read(self) -> bytes:
         try:
@@ -101,14 +111,3 @@ class SerialTransport:
 def _lock_name(path: str) -> str:
     """Return one name per port, also for links to it."""
     return str(Path(path).resolve())  # /dev/serial/by-id/… is a link to what another rig calls /dev/ttyUSB0
-
-
-def _not_opened(url: str, error: Exception, local: bool) -> TriggerError:
-    """Return the error with advice for its cause: no permission, a wrong address, or a missing port."""
-    if getattr(error, "errno", None) in (errno.EACCES, errno.EPERM):
-        return TriggerError(f"{url} may not be opened: permission denied", hint=UDEV_HINT)
-    if not local:
-        return TriggerError(f"{url} cannot be opened: {error}", hint="check the address")
-    ports = ", ".join(sorted(port.device for port in comports()))
-    what = "is not there" if not Path(url).exists() else f"cannot be opened: {error}"
-    return TriggerError(f"{url} {what}", possible=ports or "no serial port", hint="check cable and power")
