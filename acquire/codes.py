@@ -245,7 +245,22 @@ def prbs(degree: int, state: int, start: int, length: int) -> NDArray[np.uint8]:
     window = _window(degree, state, start)
     if length <= degree:
         return window[:length]
-    return _extend(window, TAPS[degree], length)
+    import numpy as np
+
+    out = np.empty(length, np.uint8)
+    out[:degree] = window
+    # in blocks whose lag doubles whenever enough bits are known
+    taps, known, scale = TAPS[degree], degree, 1
+    while known < length:
+        while max(taps) * 2 * scale <= known:
+            scale *= 2
+        count = min(min(taps) * scale, length - known)
+        block = out[known : known + count]
+        block[:] = 0
+        for tap in taps:
+            block ^= out[known - tap * scale : known - tap * scale + count]
+        known += count
+    return out
 
 
 def state_at(degree: int, state: int, index: int) -> int:
@@ -326,22 +341,3 @@ def _x_power(exponent: int, degree: int) -> int:
         while (excess := result.bit_length() - 1 - degree) >= 0:
             result ^= poly << excess
     return result
-
-
-def _extend(window: NDArray[np.uint8], taps: tuple[int, ...], length: int) -> NDArray[np.uint8]:
-    """Continue ``window`` to ``length`` bits in blocks whose lag doubles whenever enough bits are known."""
-    import numpy as np
-
-    out = np.empty(length, np.uint8)
-    out[: len(window)] = window
-    known, scale = len(window), 1
-    while known < length:
-        while max(taps) * 2 * scale <= known:
-            scale *= 2
-        count = min(min(taps) * scale, length - known)
-        block = out[known : known + count]
-        block[:] = 0
-        for tap in taps:
-            block ^= out[known - tap * scale : known - tap * scale + count]
-        known += count
-    return out

@@ -74,7 +74,22 @@ class Fibre:
     def __post_init__(self) -> None:
         _check_sizes(self.stages, self.substeps, self.rows, self.columns)
         for arm in ARMS:
-            self._check_bands(arm)
+            firsts, width = self.bands(arm), self.band_pixels(arm)
+            needed = self.tile_rows if arm == "a" else self.tile_columns
+            if len(firsts) != needed:
+                raise UsageError(
+                    f"fibre: {len(firsts)} bands on sensor {arm.upper()} cannot show a scene of "
+                    f"{self.rows} x {self.columns}",
+                    possible=f"{needed} bands of {self.size} {'rows' if arm == 'a' else 'columns'} each",
+                )
+            edges = sorted(firsts)
+            overlap = any(after < before + width for before, after in pairwise(edges))
+            if overlap or edges[0] < 0 or edges[-1] + width > self.sensor_pixels:
+                raise UsageError(
+                    f"fibre: bands of {width} columns that begin at {', '.join(map(str, firsts))} overlap or "
+                    f"do not fit on the {self.sensor_pixels} columns of sensor {arm.upper()}",
+                    possible=f"first columns from 0 to {self.sensor_pixels - width}, at least {width} apart",
+                )
 
     @classmethod
     def side_by_side(
@@ -199,24 +214,6 @@ class Fibre:
         stages, substeps, pixels = (int(geometry[key]) for key in ("stages", "substeps", "pixels"))
         bands = (tuple(int(first) for first in attrs["bands"][arm]) for arm in ARMS)
         return cls(stages, substeps, int(attrs["rows"]), int(attrs["columns"]), pixels, *bands)
-
-    def _check_bands(self, arm: str) -> None:
-        firsts, width = self.bands(arm), self.band_pixels(arm)
-        needed = self.tile_rows if arm == "a" else self.tile_columns
-        if len(firsts) != needed:
-            raise UsageError(
-                f"fibre: {len(firsts)} bands on sensor {arm.upper()} cannot show a scene of "
-                f"{self.rows} x {self.columns}",
-                possible=f"{needed} bands of {self.size} {'rows' if arm == 'a' else 'columns'} each",
-            )
-        edges = sorted(firsts)
-        overlap = any(after < before + width for before, after in pairwise(edges))
-        if overlap or edges[0] < 0 or edges[-1] + width > self.sensor_pixels:
-            raise UsageError(
-                f"fibre: bands of {width} columns that begin at {', '.join(map(str, firsts))} overlap or do "
-                f"not fit on the {self.sensor_pixels} columns of sensor {arm.upper()}",
-                possible=f"first columns from 0 to {self.sensor_pixels - width}, at least {width} apart",
-            )
 
 
 def _check_sizes(stages: int, substeps: int, rows: int, columns: int) -> None:

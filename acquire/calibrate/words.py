@@ -135,18 +135,13 @@ def _quantities(quantities: Any) -> dict[str, str]:
         error = quantities["linearity_error"]
         facts["linearity error"] = _both(Measured(100 * error.value, 100 * error.uncertainty), " %")
     if "excess_dn" in quantities and quantities["excess_dn"].value.any():
-        facts["off the straight line by"] = _curve(quantities["excess_dn"])
+        excess = quantities["excess_dn"]
+        worst_at, ends = np.abs(excess.value).argmax(axis=1), excess.value.shape[1] - 1
+        facts["off the straight line by"] = "; ".join(
+            f"{arm} {row[at]:+.1f} ± {doubt[at]:.2g} DN at {at / ends:.0%} of white"
+            for arm, row, doubt, at in zip("ab", excess.value, excess.uncertainty, worst_at, strict=True)
+        )
     return facts
-
-
-def _curve(measured: Measured) -> str:
-    """Describe the largest excess of each arm, with its uncertainty and position."""
-    worst = np.abs(measured.value).argmax(axis=1)
-    ends = measured.value.shape[1] - 1
-    return "; ".join(
-        f"{arm} {row[at]:+.1f} ± {error[at]:.2g} DN at {at / ends:.0%} of white"
-        for arm, row, error, at in zip("ab", measured.value, measured.uncertainty, worst, strict=True)
-    )
 
 
 def _blur(measured: Measured) -> str:

@@ -93,24 +93,22 @@ def _account(panel: Panel) -> dict[str, Any]:
         "known": {key: known.get(key) for key in KNOWN},
         "error": error_in_words(known["error"]) if known.get("error") else None,
         "calibration": (known.get("calibration") or {}).get("corrected"),
-        "parts": [_part(number, part) for number, part in enumerate(parts[:MOST_PARTS], 1)],
+        "parts": [
+            {
+                "name": part["name"] or str(number),
+                "lines": f"{part['first_line']} … {part['first_line'] + part['lines'] - 1}",
+                "voxels": f"{part['spatial_merge']} × {part['temporal_merge']}",
+                "iterations": part["iterations"],
+                "seconds": part["seconds"],
+                "processor_s": part.get("processor_s"),
+                "misfit_percent": _percent(part["quality"]["misfit"]),
+                "prediction_percent": _percent(part["quality"]["prediction"]),
+                "trusted": part["trusted"],
+            }
+            for number, part in enumerate(parts[:MOST_PARTS], 1)
+        ],
         "more_parts": max(0, len(parts) - MOST_PARTS),
         "warnings": known.get("warnings", list(dict.fromkeys(of_parts)))[:MOST_PARTS],
-    }
-
-
-def _part(number: int, part: dict[str, Any]) -> dict[str, Any]:
-    quality = part["quality"]
-    return {
-        "name": part["name"] or str(number),
-        "lines": f"{part['first_line']} … {part['first_line'] + part['lines'] - 1}",
-        "voxels": f"{part['spatial_merge']} × {part['temporal_merge']}",
-        "iterations": part["iterations"],
-        "seconds": part["seconds"],
-        "processor_s": part.get("processor_s"),
-        "misfit_percent": _percent(quality["misfit"]),
-        "prediction_percent": _percent(quality["prediction"]),
-        "trusted": part["trusted"],
     }
 
 

@@ -113,7 +113,19 @@ class LineFile:
 @contextmanager
 def open_lines(path: Path, layout: Layout) -> Iterator[LineFile]:
     """Open a file of lines. Raises UsageError if it does not hold lines, PlaceError if there is no file."""
-    kind = _kind(path, layout)
+    kind = KINDS.get(path.suffix.lower())
+    if layout.dtype is not None or layout.pixels is not None:
+        kind = "raw"
+    elif kind == "raw":
+        raise UsageError(
+            f"{path} is raw binary, which does not define its layout", hint="--dtype and --pixels"
+        )
+    elif kind is None:
+        raise UsageError(
+            f"the format of {path} cannot be taken from its name",
+            possible=", ".join(KINDS),
+            hint="--dtype and --pixels for raw binary",
+        )
     openers = {"NumPy": _numpy, "HDF5": _hdf5, "TIFF": _tiff, "raw": _raw}
     with ExitStack() as held:
         check_file(path)
@@ -150,23 +162,6 @@ def mapped(path: Path) -> np.memmap[Any, np.dtype[Any]]:
         if file.read(len(ARCHIVE)) == ARCHIVE:
             raise UsageError(f"{path} is an archive of several arrays", possible="one array in a .npy file")
     return npy.open_memmap(path, mode="r")
-
-
-def _kind(path: Path, layout: Layout) -> str:
-    if layout.dtype is not None or layout.pixels is not None:
-        return "raw"
-    kind = KINDS.get(path.suffix.lower())
-    if kind == "raw":
-        raise UsageError(
-            f"{path} is raw binary, which does not define its layout", hint="--dtype and --pixels"
-        )
-    if kind is None:
-        raise UsageError(
-            f"the format of {path} cannot be taken from its name",
-            possible=", ".join(KINDS),
-            hint="--dtype and --pixels for raw binary",
-        )
-    return kind
 
 
 def _cropped(file: LineFile, columns: tuple[int, int]) -> LineFile:

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
     from typing_extensions import Buffer
 
-    from acquire.exchange.content import Array, Axis, Content
+    from acquire.exchange.content import Array, Content
 
 CHUNK_BYTES = 2**20
 
@@ -108,7 +108,15 @@ def _write_entry(file: Any, content: Content, advance: Callable[[int], object]) 
     data.attrs["axes"] = [axis.name if axis.step else "." for axis in content.axes]
     for number, axis in enumerate(content.axes):
         if axis.step:
-            _write_axis(data, axis, content.image.shape[number])
+            # line numbers are integers
+            whole = axis.step == int(axis.step) and axis.first == int(axis.first)
+            count = content.image.shape[number]
+            dataset = data.create_dataset(axis.name, (count,), "<i8" if whole else "<f8")
+            dataset.attrs["units"] = axis.unit
+            # Chunk by chunk, since there can be very many lines.
+            for start in range(0, count, CHUNK_BYTES // 8):
+                stop = min(count, start + CHUNK_BYTES // 8)
+                dataset[start:stop] = axis.first + axis.step * np.arange(start, stop)
             data.attrs[f"{axis.name}_indices"] = number
     names = [axis.name for axis in content.axes]
     _write(data, content.image, advance)
@@ -131,19 +139,6 @@ def _group(parent: Any, name: str, kind: str, **attributes: str) -> Any:
     group = parent.create_group(name)
     group.attrs.update({"NX_class": kind, **attributes})
     return group
-
-
-def _write_axis(data: Any, axis: Axis, count: int) -> None:
-    """Write coordinates chunk by chunk, since there can be very many lines."""
-    assert axis.step is not None
-    # line numbers are integers
-    whole = axis.step == int(axis.step) and axis.first == int(axis.first)
-    dataset = data.create_dataset(axis.name, (count,), "<i8" if whole else "<f8")
-    dataset.attrs["units"] = axis.unit
-    size = CHUNK_BYTES // 8
-    for start in range(0, count, size):
-        stop = min(count, start + size)
-        dataset[start:stop] = axis.first + axis.step * np.arange(start, stop)
 
 
 def _write(data: Any, array: Array, advance: Callable[[int], object]) -> None:

@@ -131,7 +131,17 @@ def _light(segment: Segment) -> _Light | None:
     masked = 1 - float(usable.mean(axis=(1, 2)).min())
     if geometry.lines < FEWEST_PASSES * geometry.stages or masked > MOST_MASKED:
         return None
-    arms = [_filled(lines, good) for lines, good in zip(samples, usable, strict=True)]
+    arms = []
+    columns = np.arange(samples.shape[2])
+    for lines, good in zip(samples, usable, strict=True):
+        if good.all():
+            arms.append(lines)
+            continue
+        count = good.sum(0)
+        seen = np.flatnonzero(count)
+        # a column that is masked throughout takes the mean of its neighbours
+        means = np.interp(columns, seen, np.where(good, lines, 0).sum(0)[seen] / count[seen])
+        arms.append(np.where(good, lines, means))
     slopes = [0.0, 0.0]
     if segment.alignment is None:
         # the steepest mean difference between the outermost columns at either end of an arm
@@ -142,18 +152,6 @@ def _light(segment: Segment) -> _Light | None:
             steepest, mean = np.abs((end - begin) / np.arange(1, width + 1)).max(), float(profile.mean())
             slopes[k] = float(steepest) / mean if mean > 0 else 0.0
     return _Light(np.stack([arm.sum(1) for arm in arms]), (slopes[0], slopes[1]), masked)
-
-
-def _filled(lines: Floats, usable: NDArray[np.bool_]) -> Floats:
-    """Lines (line, column) with masked samples replaced by their column's mean, or by the neighbouring
-    columns' if all of a column are masked."""
-    if usable.all():
-        return lines
-    count = usable.sum(0)
-    seen = np.flatnonzero(count)
-    columns = np.arange(lines.shape[1])
-    means = np.interp(columns, seen, np.where(usable, lines, 0).sum(0)[seen] / count[seen])
-    return np.where(usable, lines, means)
 
 
 def divided(segment: Segment, balance: Balance) -> Segment:

@@ -73,7 +73,12 @@ def estimate_coefficients(
     # whatever the dtype of the video: only the end of the signal is wanted
     arrays = replace(problem.arrays, dtype="float32")
     theta = _tentative(segment, (merge, temporal_merge), most, hurry, arrays)
-    last = _end_of_signal(np.square(theta, dtype=np.float64).sum((1, 2)))
+    energy = np.square(theta, dtype=np.float64).sum((1, 2))
+    floor = energy[len(energy) // 2 :]
+    above = np.flatnonzero(energy > floor.max())
+    # it may be no floor, the more so if nothing is above it; in doubt the band is wide
+    doubtful = floor.max() > PEAK * np.median(floor) or not len(above)
+    last = len(energy) if doubtful else int(above[-1]) + 1
     slow = MARGIN * last <= FEWEST_COEFFICIENTS
     if is_large(segment.geometry, spatial_merge) or not slow:
         last = max(last, fastest_lamp(segment, problem, temporal_merge, hurry, affords))
@@ -152,13 +157,3 @@ def _tentative(
             break
         solver.step()
     return host(solver.theta)
-
-
-def _end_of_signal(energy: NDArray[np.float64]) -> int:
-    """The number of coefficients up to the last above the floor; all of them if there is no floor."""
-    floor = energy[len(energy) // 2 :]
-    if floor.max() > PEAK * np.median(floor):
-        return len(energy)
-    above = np.flatnonzero(energy > floor.max())
-    # nothing above the floor: it may be none, and in doubt the band is wide
-    return int(above[-1]) + 1 if len(above) else len(energy)

@@ -8,7 +8,7 @@ cycles shows which change of it explains most of what is left (Gauss–Newton).
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -57,7 +57,14 @@ def find_period(theta: Array, basis: Basis) -> float | None:
     change = float(np.trace(gram))
     if len(tried) < 3 or not change > ROUNDING * np.square(flat[0]).sum():
         return None
-    energy = _spectrum(gram, basis.matrix(2 * basis.cosines)[1:], np.arange(0, last + STEP, STEP))
+    # the energy of the change at numbers of cycles in the span, on a grid of instants
+    rows, cycles = basis.matrix(2 * basis.cosines)[1:].astype(np.float64), np.arange(0, last + STEP, STEP)
+    instants, energy = rows.shape[1], np.zeros(len(cycles))
+    angle = 2 * np.pi * cycles[:, None] * ((np.arange(instants) + 0.5) / instants - 0.5)
+    for wave in (np.cos(angle), np.sin(angle)):
+        # a wave's mean square is ½
+        part = wave @ rows.T * (2 / instants) ** 0.5
+        energy += (part @ gram * part).sum(1)
     harmonics = np.minimum(last // (tried * STEP), MOST_HARMONICS).astype(int)
     held = np.zeros(len(tried))
     for harmonic in range(1, MOST_HARMONICS + 1):
@@ -71,23 +78,6 @@ def find_period(theta: Array, basis: Basis) -> float | None:
         return None
     near = np.flatnonzero(np.abs(tried - tried[good[-1]]) * STEP <= LOBE)
     return basis.frames / (STEP * float(tried[near[comb[near].argmax()]]))
-
-
-def _spectrum(
-    gram: NDArray[np.float64], rows: NDArray[Any], cycles: NDArray[np.float64]
-) -> NDArray[np.float64]:
-    """The energy of a change at numbers of ``cycles`` in the span, by the ``gram`` of its coefficients.
-
-    ``rows`` is their basis on a grid of instants.
-    """
-    instants = rows.shape[1]
-    angle = 2 * np.pi * cycles[:, None] * ((np.arange(instants) + 0.5) / instants - 0.5)
-    rows, total = rows.astype(np.float64), np.zeros(len(cycles))
-    for wave in (np.cos(angle), np.sin(angle)):
-        # a wave's mean square is ½
-        part = wave @ rows.T * (2 / instants) ** 0.5
-        total += (part @ gram * part).sum(1)
-    return total
 
 
 def better_period(

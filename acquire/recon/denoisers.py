@@ -82,26 +82,21 @@ class HaarShrink:
             step = 1 << level
             if step >= min(frames.shape[1:]):
                 break
-            smooth, kept = _level(smooth, step, threshold)
-            details += kept
+            a, b = smooth, namespace(smooth).roll(smooth, -step, axis=2)
+            bands = []
+            for part in ((a + b) / 2, (a - b) / 2):
+                below = namespace(part).roll(part, -step, axis=1)
+                bands += [(part + below) / 2, (part - below) / 2]
+            kept = []
+            for band, sign in zip(bands[1:], _SIGNS, strict=True):
+                xp = namespace(band)
+                # Bands are sums of four voxels over 4, not 2 as in an orthonormal transform: half of its
+                # threshold.
+                shrunk = xp.sign(band) * xp.maximum(xp.abs(band) - threshold / 2, 0)
+                kept.append(_undo(shrunk, step, sign))
+            smooth = _undo(bands[0], step, (1, 1))
+            details += sum(kept[1:], kept[0])
         return smooth + details
-
-
-def _level(smooth: Array, step: int, threshold: Array) -> tuple[Array, Array]:
-    """The next smooth part and the shrunk details, which add up to ``smooth`` for a threshold of 0."""
-    a, b = smooth, namespace(smooth).roll(smooth, -step, axis=2)
-    parts = [(a + b) / 2, (a - b) / 2]
-    bands = []
-    for part in parts:
-        below = namespace(part).roll(part, -step, axis=1)
-        bands += [(part + below) / 2, (part - below) / 2]
-    kept = []
-    for band, sign in zip(bands[1:], _SIGNS, strict=True):
-        xp = namespace(band)
-        # bands are sums of four voxels over 4, not 2 as in an orthonormal transform: half of its threshold
-        shrunk = xp.sign(band) * xp.maximum(xp.abs(band) - threshold / 2, 0)
-        kept.append(_undo(shrunk, step, sign))
-    return _undo(bands[0], step, (1, 1)), sum(kept[1:], kept[0])
 
 
 _SIGNS = ((-1, 1), (1, -1), (-1, -1))

@@ -50,7 +50,13 @@ def check_description(segment: Segment, quality: Quality, clock: IterationClock)
     # some right descriptions are unclear: what is uncertain is not a contradiction
     believed = found.standing in (Standing.RIGHT, Standing.UNCLEAR)
     words = found.sentences
-    if found.standing is Standing.UNEXPLAINED and _predicted(quality):
+    # not by the used samples: a video has voxels enough to follow their noise
+    predicted = (
+        0 < quality.noise <= PREDICTED_NOISE
+        and not math.isnan(quality.prediction)
+        and quality.prediction**2 - quality.noise**2 < SUSPICIOUS**2
+    )
+    if found.standing is Standing.UNEXPLAINED and predicted:
         # the video shows what the diagnosis, whose model is simpler, could not: the code does explain them
         words, believed = tuple(each for each in words if each != found.sentence), True
     if found.standing is Standing.RIGHT and residual > POOR_MISFIT:
@@ -59,13 +65,3 @@ def check_description(segment: Segment, quality: Quality, clock: IterationClock)
             "voxels or a higher bandwidth may explain them",
         )
     return DescriptionCheck(words, believed)
-
-
-def _predicted(quality: Quality) -> bool:
-    """Whether the samples that the reconstruction never saw are predicted to their noise.
-
-    Not the used ones: a video has voxels enough to follow their noise.
-    """
-    if not 0 < quality.noise <= PREDICTED_NOISE or math.isnan(quality.prediction):
-        return False
-    return quality.prediction**2 - quality.noise**2 < SUSPICIOUS**2

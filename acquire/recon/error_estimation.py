@@ -134,9 +134,15 @@ def _under_heavier_prior(
         continuation.step()
     if made < FEWEST_HEAVIER:
         return NO_TIME
-    drift = _drift_exponent(distances, BY_PRIOR.floor * full_scale(video[trusted]))
-    if drift is None:
+    # the drift's growth over the last half or more of the iterations
+    last = max(distances, default=0)
+    early = max((each for each in distances if each <= last / 2), default=None)
+    if early is None:
         drift = ASSUMED_DRIFT if clock.ended == "budget" else 0.0
+    else:
+        floor = max(BY_PRIOR.floor * full_scale(video[trusted]), 1e-30)
+        change = [np.hypot(distances[each], floor) for each in (early, last)]
+        drift = float(np.clip(np.log(change[1] / change[0]) / np.log(last / early), -1, 1))
     # a negative drift is that of a solver that converges: its change is not extrapolated to a smaller one
     return Continued(continuation.video(), made, max(drift, 0.0), drift)
 
@@ -172,16 +178,6 @@ def _shown(video: NDArray[Any], problem: Problem) -> NDArray[Any]:
     video *= problem.scale
     np.maximum(video, 0, out=video)
     return video
-
-
-def _drift_exponent(distances: dict[int, float], floor: float) -> float | None:
-    """Exponent, -1 to 1, of the drift's growth over the last half or more iterations; None for too few."""
-    last = max(distances, default=0)
-    early = max((each for each in distances if each <= last / 2), default=None)
-    if early is None:
-        return None
-    change = [np.hypot(distances[each], max(floor, 1e-30)) for each in (early, last)]
-    return float(np.clip(np.log(change[1] / change[0]) / np.log(last / early), -1, 1))
 
 
 def white_error(segment: Segment, problem: Problem, merges: tuple[int, int]) -> float:

@@ -79,9 +79,12 @@ class InBand:
         return host(self.basis.synthesize(self.solver.theta))
 
     def facts(self) -> dict[str, Any]:
-        # the bands are what `reconstruct` derives ``resolved_hz`` from
-        found = {"temporal_coefficients": self.basis.cosines, "bands": _runs(self.basis.held)}
-        return found | asdict(self._parameters)
+        held = self.basis.held
+        last = np.flatnonzero(np.diff(held, append=held[-1] + 2) > 1)
+        first = np.concatenate([[0], last[:-1] + 1])
+        # runs of successive cosines, from which `reconstruct` derives ``resolved_hz``
+        bands = [(int(held[a]), int(held[b]) + 1) for a, b in zip(first, last, strict=True)]
+        return {"temporal_coefficients": self.basis.cosines, "bands": bands} | asdict(self._parameters)
 
     def step(self) -> None:
         self.solver.step()
@@ -128,13 +131,6 @@ class Refined:
         still: bool = False,  # noqa: ARG002 (the protocol's; nothing here is added to a still)
     ) -> Refinement:
         return self._refinement.with_problem(problem, heavier)
-
-
-def _runs(held: NDArray[np.int64]) -> list[tuple[int, int]]:
-    """First and end of each run of successive cosines."""
-    last = np.flatnonzero(np.diff(held, append=held[-1] + 2) > 1)
-    first = np.concatenate([[0], last[:-1] + 1])
-    return [(int(held[a]), int(held[b]) + 1) for a, b in zip(first, last, strict=True)]
 
 
 class Preferred:

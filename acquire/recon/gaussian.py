@@ -100,12 +100,14 @@ class Response:
         running = np.concatenate([np.zeros((1, FAST)), np.cumsum(windows, axis=0)])
         # summed twice, the light of any range of rows is a difference of two elements
         first = (np.arange(lines) * substeps)[:, None]
-        # float32: the products with these take most of the time, and the noise is far above its rounding
+        self.tiers: list[tuple[slice, NDArray[np.float32]]] = []
         tiers = ((0, FINE, pixels * finer), (FINE, SLOW, pixels), (SLOW, FAST, min(pixels, FAST_ROWS)))
-        self.tiers = [
-            (slice(begin, end), _block_sums(running[:, begin:end], first, rows, blocks).astype(np.float32))
-            for begin, end, blocks in tiers
-        ]
+        for begin, end, blocks in tiers:
+            # row r is exposed r sub-steps after the first
+            edges = np.linspace(0, rows, blocks + 1).round().astype(np.int64)
+            sums = np.diff(running[:, begin:end][first + edges], axis=1)
+            # float32: the products with these take most of the time, and the noise is far above its rounding
+            self.tiers.append((slice(begin, end), sums.astype(np.float32)))
         # a uniform scene at rest is cosine 0 in every block
         self.flat: Floats = self.tiers[0][1][:, :, 0].sum(1, dtype=np.float64)
 
@@ -117,12 +119,6 @@ class Response:
             smoothed = (near @ factor) * prior.spectrum[cosines].astype(np.float32)
             total += smoothed.reshape(self.lines, -1) @ factor.reshape(self.lines, -1).T
         return total.astype(np.float64)
-
-
-def _block_sums(running: Floats, first: NDArray[np.int64], rows: int, blocks: int) -> Floats:
-    """Sums (line, block, cosine) of running sums in time: row r is exposed r sub-steps after the first."""
-    edges = np.linspace(0, rows, blocks + 1).round().astype(np.int64)
-    return np.diff(running[first + edges], axis=1)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -203,7 +199,15 @@ class Model:
         rest = modes - sum(amount * each for amount, each in zip(amounts, regressors, strict=True))
         scale = max(float((rest**2 / self._variance).mean()), SMALLEST)
         amount = float(amounts[1]) if len(amounts) > 1 else 0.0
-        return Fit(rest, float(amounts[0]), scale, self._blocks(rest, scale), amount)
+        lines = self.response.lines
+        # The log likelihood of a line is its part of the quadratic form, and an equal part of the rest.
+        # back from modes to lines; across pixels modes do as well, since sums of squares are the same
+        values, pulled = self._vectors @ rest, self._vectors @ (rest / self._variance)
+        per_line = (values * pulled).sum(1) / scale
+        constant = (np.log(self._variance).sum() + rest.size * np.log(scale)) / lines
+        edges = np.linspace(0, lines, max(1, round(lines / BLOCK_LINES)) + 1).round().astype(int)
+        evidence = np.asarray(-0.5 * np.add.reduceat(per_line + constant, edges[:-1]))
+        return Fit(rest, float(amounts[0]), scale, evidence, amount)
 
     def evidence(self, modes: Floats) -> float:
         """Log likelihood of lines given as modes."""
@@ -220,16 +224,6 @@ class Model:
         inverse = np.linalg.inv(normal + SMALLEST * np.eye(len(normal)))
         amounts = inverse @ np.array([float((a * modes).sum()) for a in weighted])
         return amounts.astype(np.float64), inverse.astype(np.float64)
-
-    def _blocks(self, rest: Floats, scale: float) -> Floats:
-        """Log likelihood, divided among blocks of lines by their share of the quadratic form."""
-        lines = self.response.lines
-        # back from modes to lines; across pixels modes do as well, since sums of squares are the same
-        values, pulled = self._vectors @ rest, self._vectors @ (rest / self._variance)
-        per_line = (values * pulled).sum(1) / scale
-        constant = (np.log(self._variance).sum() + rest.size * np.log(scale)) / lines
-        edges = np.linspace(0, lines, max(1, round(lines / BLOCK_LINES)) + 1).round().astype(int)
-        return np.asarray(-0.5 * np.add.reduceat(per_line + constant, edges[:-1]))
 
     def scene(self, fit: Fit) -> NDArray[np.float32]:
         """The most likely slow scene (fine row, cosine, pixel), in units of the lines per sub-step."""

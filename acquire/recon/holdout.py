@@ -49,23 +49,18 @@ def held_out_blocks(
     # halve the longer side until there are enough blocks
     while lines * pixels > 1 and usable.size * share < FEWEST_BLOCKS * lines * pixels:
         lines, pixels = (-(-lines // 2), pixels) if lines >= pixels else (lines, -(-pixels // 2))
-    drawn = np.stack([_drawn(arm.shape, (lines, pixels), share, rng) for arm in usable])
-    return usable & drawn
-
-
-def _drawn(
-    shape: tuple[int, ...], size: tuple[int, int], share: float, rng: np.random.Generator
-) -> NDArray[np.bool_]:
-    """Mask of one arm's tiles of ``size``: a share of them, rounded at random, is drawn."""
-    # one more than cover the arm, because the origin is random
-    tiles = [-(-length // side) + 1 for length, side in zip(shape, size, strict=True)]
-    count = tiles[0] * tiles[1]
-    chosen = np.zeros(count, bool)
-    # rounded at random, so that the share is right on average even if there are few tiles
-    chosen[rng.permutation(count)[: int(count * share + rng.random())]] = True
-    begin = [int(rng.integers(side)) for side in size]
-    whole = chosen.reshape(tiles).repeat(size[0], axis=0).repeat(size[1], axis=1)
-    return whole[begin[0] : begin[0] + shape[0], begin[1] : begin[1] + shape[1]]
+    drawn: list[NDArray[np.bool_]] = []
+    for arm in usable:
+        # one more than cover the arm, because the origin is random
+        tiles = [-(-length // side) + 1 for length, side in zip(arm.shape, (lines, pixels), strict=True)]
+        count = tiles[0] * tiles[1]
+        chosen = np.zeros(count, bool)
+        # rounded at random, so that the share is right on average even if there are few tiles
+        chosen[rng.permutation(count)[: int(count * share + rng.random())]] = True
+        line, pixel = (int(rng.integers(side)) for side in (lines, pixels))
+        whole = chosen.reshape(tiles).repeat(lines, axis=0).repeat(pixels, axis=1)
+        drawn.append(whole[line : line + arm.shape[0], pixel : pixel + arm.shape[1]])
+    return usable & np.stack(drawn)
 
 
 class HeldOut:

@@ -246,21 +246,14 @@ def prepared_lines(segment: Segment) -> tuple[int, tuple[Floats, Floats]]:
     mask = segment.mask[:, first : first + length] & np.isfinite(samples)
     stages = segment.geometry.stages
     edges = np.linspace(0, stages, min(MOST_PIXELS, stages) + 1).round().astype(int)
-    a, b = (
-        np.asarray(np.add.reduceat(_filled(arm, known), edges[:-1], axis=1) / np.diff(edges))
-        for arm, known in zip(samples, mask, strict=True)
-    )
-    return first, (a, b)
-
-
-def _filled(lines: Floats, known: NDArray[np.bool_]) -> Floats:
-    if known.all():
-        return lines
-    out, at = lines.copy(), np.arange(len(lines))
-    for pixel in np.flatnonzero(~known.all(0)):
-        good = known[:, pixel]
-        out[:, pixel] = np.interp(at, at[good], lines[good, pixel]) if good.any() else 0.0
-    return out
+    arms, at = [], np.arange(length)
+    for arm, known in zip(samples, mask, strict=True):
+        lines = arm.copy()
+        for pixel in np.flatnonzero(~known.all(0)):
+            good = known[:, pixel]
+            lines[:, pixel] = np.interp(at, at[good], arm[good, pixel]) if good.any() else 0.0
+        arms.append(np.asarray(np.add.reduceat(lines, edges[:-1], axis=1) / np.diff(edges)))
+    return first, (arms[0], arms[1])
 
 
 def compare(one: Floats, other: Floats) -> tuple[float, float]:

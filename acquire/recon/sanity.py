@@ -49,28 +49,23 @@ def unusable(segment: Segment) -> list[Suspicion]:
         if not mask.any():
             found.append(Suspicion("no_samples", f"arm {arm} has no usable sample"))
             continue
-        found += _stuck(arm, np.where(mask, lines, np.nan), segment.geometry.lines)
+        known = np.where(mask, lines, np.nan)
+        seen = np.isfinite(known).any(0)
+        lowest, highest = np.nanmin(known[:, seen], axis=0), np.nanmax(known[:, seen], axis=0)
+        # a single line cannot change, and darkness does not
+        if segment.geometry.lines == 1 or not highest.any():
+            continue
+        still = lowest == highest
+        # a constant column at the lowest level may be dark, and is no evidence
+        lit = ~still | (highest > lowest.min())
+        share = 1.0 if still.all() else float(still[lit].mean())
+        if share > STUCK_SHARE:
+            words = f"arm {arm} is stuck: {share:.0%} of its lit columns are the same in every line"
+            found.append(Suspicion("stuck", words))
     if segment.code.min() == segment.code.max():
         words = f"the code is {int(segment.code[0])} throughout: lines cannot be compared with it"
         found.append(Suspicion("constant_code", words))
     return found
-
-
-def _stuck(arm: str, lines: Floats, count: int) -> list[Suspicion]:
-    """Whether most of an arm's lit columns do not change from line to line."""
-    seen = np.isfinite(lines).any(0)
-    lowest, highest = np.nanmin(lines[:, seen], axis=0), np.nanmax(lines[:, seen], axis=0)
-    # a single line cannot change, and darkness does not
-    if count == 1 or not highest.any():
-        return []
-    still = lowest == highest
-    # a constant column at the lowest level may be dark, and is no evidence
-    lit = ~still | (highest > lowest.min())
-    if still.all() or still[lit].mean() > STUCK_SHARE:
-        share = 1.0 if still.all() else float(still[lit].mean())
-        words = f"arm {arm} is stuck: {share:.0%} of its lit columns are the same in every line"
-        return [Suspicion("stuck", words)]
-    return []
 
 
 def black_level_off(segment: Segment) -> list[Suspicion]:

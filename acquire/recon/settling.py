@@ -101,25 +101,22 @@ class _Course:
             weight = self.refinement.parameters.tv_weight
             self.refinement.step()
             if self.refinement.at_round_end:
-                self._judge(weight)
+                predicted = self.refinement.predict()
+                error = self._problem.prediction_error(predicted)
+                self.fits_noise = self._problem.misfit(predicted) < self._noise
+                # without held-out samples the error is NaN, which never counts as idle
+                least_gain = LEAST_GAIN if self.refinement.loosens else LEAST_GAIN_HELD
+                self._idle = self._idle + 1 if error >= (1 - least_gain) * self.recent else 0
+                self.recent = min(self.recent, error)
+                # NaN, without held-out samples, makes the last round the best
+                if not error >= self._best:
+                    self._best, self._kept = error, (self.refinement, self.refinement.found)
+                if self.refinement.loosens:
+                    self._loosened.append((error, weight))
                 in_vain = 1 if self.fits_noise and self.refinement.loosens else patience
                 if self._idle >= in_vain:
                     return True
         return False
-
-    def _judge(self, weight: float) -> None:
-        predicted = self.refinement.predict()
-        error = self._problem.prediction_error(predicted)
-        self.fits_noise = self._problem.misfit(predicted) < self._noise
-        # without held-out samples the error is NaN, which never counts as idle
-        least_gain = LEAST_GAIN if self.refinement.loosens else LEAST_GAIN_HELD
-        self._idle = self._idle + 1 if error >= (1 - least_gain) * self.recent else 0
-        self.recent = min(self.recent, error)
-        # NaN, without held-out samples, makes the last round the best
-        if not error >= self._best:
-            self._best, self._kept = error, (self.refinement, self.refinement.found)
-        if self.refinement.loosens:
-            self._loosened.append((error, weight))
 
     @property
     def likely_weight(self) -> float:

@@ -67,7 +67,13 @@ class SignSplit:
         background = self._background
         self._known = None if background is None else self._xp.tensordot(grid.T, background, axes=1)
         self._is_compiled = is_numpy_array(grid) and shape[0] <= FEW and background is None
-        self._parts = self._in_parts()
+        # Temporary arrays are small in parts, where that costs no time: a product of many rows is slower in
+        # parts, and so is everything on other devices.
+        rows, *frame = shape
+        instants = grid.shape[1]
+        at_once = max(PART_PIXELS // math.prod(frame), PART_ROWS * rows)
+        step = at_once if is_numpy_array(grid) else instants
+        self._parts = [slice(first, first + step) for first in range(0, instants, step)]
 
     def advance(self, theta: Array) -> None:
         """Take the light of coefficients for v, and what of it is negative for the multiplier."""
@@ -129,14 +135,3 @@ class SignSplit:
     def _negative(self, some: slice) -> Array:
         negative = self._xp.minimum(self._signed[some, ...], 0)
         return negative if self._scale == 1 else self._scale * negative
-
-    def _in_parts(self) -> list[slice]:
-        """Slices of the instants whose temporary arrays are small, where that costs no time.
-
-        A product of many rows is slower in parts, and so is everything on other devices.
-        """
-        rows, *frame = self._shape
-        instants = self._grid.shape[1]
-        at_once = max(PART_PIXELS // math.prod(frame), PART_ROWS * rows)
-        step = at_once if is_numpy_array(self._grid) else instants
-        return [slice(first, first + step) for first in range(0, instants, step)]

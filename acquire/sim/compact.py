@@ -56,7 +56,14 @@ class SideBySide:
 
     def next_block(self, timeout_s: float) -> CameraBlock | None:
         """Return the next lines that every part has delivered, side by side."""
-        while (blocks := self._blocks(timeout_s)) is not None:
+        while True:
+            for number, camera in enumerate(self._parts):
+                if self._waiting[number] is None:
+                    self._waiting[number] = camera.next_block(timeout_s)
+                # the blocks of other parts are kept until this one has one, too
+                if self._waiting[number] is None:
+                    return None
+            blocks = [block for block in self._waiting if block is not None]
             # a part that lost lines has blocks that begin and end elsewhere
             first = max(block.first_line for block in blocks)
             end = min(block.first_line + len(block.flags) for block in blocks)
@@ -74,16 +81,6 @@ class SideBySide:
                     # what is wrong with a line of one image is wrong with the sensor's line
                     flags |= block.flags[part]
                 return CameraBlock(first, pixels, flags)
-        return None
-
-    def _blocks(self, timeout_s: float) -> list[CameraBlock] | None:
-        """Return a block of every part; None if one has none yet, and those of the others are kept."""
-        for number, part in enumerate(self._parts):
-            if self._waiting[number] is None:
-                self._waiting[number] = part.next_block(timeout_s)
-            if self._waiting[number] is None:
-                return None
-        return [block for block in self._waiting if block is not None]
 
     def times_ns(self, first_line: int, count: int) -> NDArray[np.int64]:
         return self._parts[0].times_ns(first_line, count)

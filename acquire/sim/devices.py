@@ -162,10 +162,30 @@ class SimulatedCamera:
             return None
         pulses = self._first_pulse + self._delivered + self._block_lines
         reading = self._wire.wait(self._train, pulses, timeout_s)
-        ready = min(self._behind(reading), self._block_lines)
-        if ready < self._block_lines and not (ready and reading.stopped):
+        count = min(self._behind(reading), self._block_lines)
+        if count < self._block_lines and not (count and reading.stopped):
             return None
-        return self._read_out(reading, ready)
+        # The sensor is set up here and not in `arm`, because code and timing come with the pulses.
+        if self._light is None:
+            assert reading.train is not None
+            code = self._wire.code(reading.train)
+            self._light = self._optics.expose(reading.train, code, self._config)
+        # Line 0 begins at pulse 0 and is read out M + 1 pulses later.
+        first_line = self._first_pulse + self._delivered - self._depth_lines
+        lines = self._light.read(first_line, count)
+        first, times_ns = self._delivered, self.times_ns(self._delivered, count)
+        self._delivered += count
+        if not lines.missing.any():
+            return CameraBlock(first, lines.pixels, np.zeros(count, np.uint16), time_ns=int(times_ns[0]))
+        # A block holds consecutive lines only: one for each range between missing lines.
+        edges = np.flatnonzero(np.diff(lines.missing, prepend=True, append=True))
+        for begin, end in edges.reshape(-1, 2).tolist():
+            flags = np.zeros(end - begin, np.uint16)
+            self._ready.append(
+                CameraBlock(first + begin, lines.pixels[begin:end], flags, time_ns=int(times_ns[begin]))
+            )
+        self._lost += int(lines.missing.sum())
+        return self._ready.popleft() if self._ready else None
 
     def times_ns(self, first_line: int, count: int) -> NDArray[np.int64]:
         """Return CLOCK_MONOTONIC of the triggers of lines, which are counted since arming: (count,)."""
@@ -209,32 +229,6 @@ class SimulatedCamera:
         if reading.run < self._train:
             return 0
         return reading.issued - self._first_pulse - self._delivered
-
-    def _read_out(self, reading: Reading, count: int) -> CameraBlock | None:
-        # The sensor is set up here and not in `arm`, because code and timing come with the pulses.
-        if self._light is None:
-            assert reading.train is not None
-            code = self._wire.code(reading.train)
-            self._light = self._optics.expose(reading.train, code, self._config)
-        # Line 0 begins at pulse 0 and is read out M + 1 pulses later.
-        first_line = self._first_pulse + self._delivered - self._depth_lines
-        lines = self._light.read(first_line, count)
-        if not lines.missing.any():
-            time_ns = int(self.times_ns(self._delivered, 1)[0])
-            block = CameraBlock(self._delivered, lines.pixels, np.zeros(count, np.uint16), time_ns=time_ns)
-            self._delivered += count
-            return block
-        # A block holds consecutive lines only: one for each range between missing lines.
-        first, times_ns = self._delivered, self.times_ns(self._delivered, count)
-        edges = np.flatnonzero(np.diff(lines.missing, prepend=True, append=True))
-        for begin, end in edges.reshape(-1, 2).tolist():
-            flags = np.zeros(end - begin, np.uint16)
-            self._ready.append(
-                CameraBlock(first + begin, lines.pixels[begin:end], flags, time_ns=int(times_ns[begin]))
-            )
-        self._lost += int(lines.missing.sum())
-        self._delivered += count
-        return self._ready.popleft() if self._ready else None
 
 
 @dataclass(frozen=True, slots=True)

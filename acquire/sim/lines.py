@@ -129,28 +129,25 @@ class SeparableLines:
         done = 0
         while done < count:
             index, skip = divmod(first_line + done, TILE_LINES)
-            self._compute(index)
+            if index != self._tile_index:
+                S, start = self._substeps, 0
+                # h of every sub-step at which a line of the tile meets a row: the sum of S sub-steps of light
+                span = S * (TILE_LINES - 1) + self._size
+                lit = self._source.light(index * TILE_LINES * S, span + S - 1)
+                light: NDArray[np.float64] = sum(lit[:, u : u + span] for u in range(1, S)) + lit[:, :span]
+                for h, rows in zip(light.astype(np.float32), self._rows, strict=True):
+                    width = rows.stop - rows.start
+                    # Line i meets row r at sub-step S·i + r: lines are the product of windows of h, S apart,
+                    # with the mask.
+                    windows = sliding_window_view(h[rows.start :], width)[::S]
+                    self._windows[:, start : start + width] = windows[:TILE_LINES]
+                    start += width
+                np.matmul(self._windows, self._weights, out=self._tile)
+                self._tile_index = index
             part = self._tile[skip : skip + count - done]
             out[done : done + len(part)] = part
             done += len(part)
         return out
-
-    def _compute(self, index: int) -> None:
-        if index != self._tile_index:
-            S, start = self._substeps, 0
-            # h of every sub-step at which a line of the tile meets a row: the sum of S sub-steps of light
-            count = S * (TILE_LINES - 1) + self._size
-            lit = self._source.light(index * TILE_LINES * S, count + S - 1)
-            light: NDArray[np.float64] = sum(lit[:, u : u + count] for u in range(1, S)) + lit[:, :count]
-            for h, rows in zip(light.astype(np.float32), self._rows, strict=True):
-                width = rows.stop - rows.start
-                # Line i meets row r at sub-step S·i + r: lines are the product of windows of h, S apart, with
-                # the mask.
-                windows = sliding_window_view(h[rows.start :], width)[::S]
-                self._windows[:, start : start + width] = windows[:TILE_LINES]
-                start += width
-            np.matmul(self._windows, self._weights, out=self._tile)
-            self._tile_index = index
 
 
 class FrameLines:

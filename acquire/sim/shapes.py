@@ -43,11 +43,6 @@ def _box(row: Grid, column: Grid, half_height: float = 0.5) -> Grid:
     return _both(np.abs(row) - half_height, np.abs(column) - 0.5)
 
 
-def _disc(row: Grid, column: Grid) -> Grid:
-    radius: Grid = np.hypot(row, column)
-    return radius - 0.5
-
-
 def _triangle(row: Grid, column: Grid) -> Grid:
     """A triangle with its apex in the middle of the upper side; the lower side is its base."""
     # the flank's normal is (−1, 2)/√5: the factor makes this a distance
@@ -62,14 +57,10 @@ def _cross(row: Grid, column: Grid) -> Grid:
     return _both(diagonals - _STROKE, _box(row, column))
 
 
-def _bars(row: Grid, column: Grid) -> Grid:
-    return _box(np.abs(row) - _SPREAD, column, half_height=_STROKE)
-
-
 SHAPES: dict[str, Callable[[Grid, Grid], Grid]] = {
     "x": _cross,
     "triangle": _triangle,
-    "circle": _disc,
-    "equals": _bars,
+    "circle": lambda row, column: np.hypot(row, column) - 0.5,
+    "equals": lambda row, column: _box(np.abs(row) - _SPREAD, column, half_height=_STROKE),
     "square": _box,
 }

@@ -183,7 +183,12 @@ class TriggerModel:
             case Command.ARM:
                 self._arm(number)
             case Command.START:
-                self._start(number)
+                if self._run.state == State.IDLE:
+                    raise Refusal(ErrorCode.NOT_ARMED, at)
+                if number != self._run.number:
+                    raise Refusal(ErrorCode.WRONG_RUN, at)
+                if self._run.state == State.ARMED:
+                    self._begin(external=False)
             case Command.STOP:
                 if number not in (0, self._run.number):
                     raise Refusal(ErrorCode.WRONG_RUN, at)
@@ -217,15 +222,6 @@ class TriggerModel:
         line_clocks = self.registers.field(r.LINE, "substeps") * self.registers.get(r.SUBSTEP_CLOCKS)
         budget = self.registers.get(r.LINE_BUDGET) or None
         self._run = Run(number, State.ARMED, line_clocks=line_clocks, budget=budget)
-
-    def _start(self, number: int) -> None:
-        run = self._run
-        if run.state == State.IDLE:
-            raise Refusal(ErrorCode.NOT_ARMED, r.COMMAND.address)
-        if number != run.number:
-            raise Refusal(ErrorCode.WRONG_RUN, r.COMMAND.address)
-        if run.state == State.ARMED:
-            self._begin(external=False)
 
     def _demand_idle(self, address: int) -> None:
         """Raise Refusal while a run is armed or running."""

@@ -54,21 +54,16 @@ def check_new_path(path: Path) -> None:
         raise UsageError(f"{path}: the directory {path.parent} is not writable", hint="another directory")
     inside = path.parent.resolve()
     for directory in (inside, *inside.parents):
-        if (name := _own_format(directory)) is not None:
+        try:
+            name = read_object(directory / "zarr.json")["attributes"]["format"]
+        except (OSError, ValueError, LookupError, TypeError):
+            continue
+        if isinstance(name, str) and name.startswith("acquire-"):
             raise UsageError(
                 f"{path} would be a part of {directory}, which is of format {name!r}",
                 possible="a path outside: a copy, a check or the end of retention takes the whole directory",
                 hint=str(directory.parent / path.name),
             )
-
-
-def _own_format(directory: Path) -> str | None:
-    """Return the format of a directory that is a recording, video or calibration; None for any other."""
-    try:
-        name = read_object(directory / "zarr.json")["attributes"]["format"]
-    except (OSError, ValueError, LookupError, TypeError):
-        return None
-    return name if isinstance(name, str) and name.startswith("acquire-") else None
 
 
 def write_all(fd: int, parts: Sequence[Buffer], offset: int) -> None:

@@ -42,7 +42,20 @@ def opened(source: Source, kind: type[Kind]) -> Kind:
     """
     # The format comes first: something other than a recording is a wrong path, and not damage.
     document = read_root(source)
-    _check_format(source, _format(document))
+    name = _format(document)
+    if name not in READABLE:
+        if name is not None and name.startswith(READABLE[0].split("/")[0] + "/"):
+            raise PlaceError(
+                f"{source} is a recording of format {name!r}",
+                possible=", ".join(map(repr, READABLE)),
+                hint="a newer version of acquire",
+            )
+        of = other_kind(name) or "Zarr group"
+        raise PlaceError(
+            f"{source} is a {of}, but not a recording: format {name!r}",
+            possible=", ".join(map(repr, READABLE)),
+            hint=_SHOWN_BY.get(of, "the path of a recording"),
+        )
     try:
         check_attributes(document["attributes"])
         found = kind(source, document)
@@ -113,23 +126,6 @@ def _check_object(attributes: Any) -> None:
 def _format(document: Document) -> str | None:
     name = document["attributes"].get("format")
     return name if isinstance(name, str) else None
-
-
-def _check_format(source: Source, name: str | None) -> None:
-    if name in READABLE:
-        return
-    if name is not None and name.startswith(READABLE[0].split("/")[0] + "/"):
-        raise PlaceError(
-            f"{source} is a recording of format {name!r}",
-            possible=", ".join(map(repr, READABLE)),
-            hint="a newer version of acquire",
-        )
-    kind = other_kind(name) or "Zarr group"
-    raise PlaceError(
-        f"{source} is a {kind}, but not a recording: format {name!r}",
-        possible=", ".join(map(repr, READABLE)),
-        hint=_SHOWN_BY.get(kind, "the path of a recording"),
-    )
 
 
 def _check_complete(recording: Outline) -> None:

@@ -141,6 +141,11 @@ class Recording(Outline):
         for arm, of_arm, those in zip(stretches.values(), samples, columns, strict=True):
             arm["lines"].read(out=of_arm, columns=those)
         flags = np.stack([arm["flags"].read() for arm in stretches.values()])
+        cameras, noise = [self.attrs["cameras"][arm] for arm in ARMS], None
+        # a rig need not give the cameras' noise
+        if all(camera.get(key) is not None for camera in cameras for key in NOISE_KEYS):
+            (K_a, read_a), (K_b, read_b) = ([float(camera[key]) for key in NOISE_KEYS] for camera in cameras)
+            noise = Noise((K_a, K_b), (K_a * read_a, K_b * read_b))
         return Segment(
             lines=samples,
             mask=self._usable(samples, flags),
@@ -151,7 +156,7 @@ class Recording(Outline):
             substep_ns=self.line_period_ns / geometry.substeps,
             black_level_dn=self._per_arm("black_level_dn"),
             responsivity_dn=self._per_arm("responsivity_dn"),
-            noise=self._noise(),
+            noise=noise,
             first_column=(columns[0].start, columns[1].start),
         )
 
@@ -237,14 +242,6 @@ class Recording(Outline):
 
     def _camera_numbers(self, key: str) -> list[float]:
         return [float(self.attrs["cameras"][arm][key]) for arm in ARMS]
-
-    def _noise(self) -> Noise | None:
-        """Return the cameras' noise from the rig's configuration; None if it is not given."""
-        cameras = [self.attrs["cameras"][arm] for arm in ARMS]
-        if any(camera.get(key) is None for camera in cameras for key in NOISE_KEYS):
-            return None
-        (K_a, read_a), (K_b, read_b) = ([float(camera[key]) for key in NOISE_KEYS] for camera in cameras)
-        return Noise((K_a, K_b), (K_a * read_a, K_b * read_b))
 
     def _per_arm(self, key: str) -> float | tuple[float, float]:
         a, b = self._camera_numbers(key)

@@ -18,6 +18,7 @@ from __future__ import annotations
 import contextlib
 import copy
 from dataclasses import asdict, dataclass, replace
+from itertools import product
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -54,8 +55,6 @@ from acquire.store.table import event_table, gap_table
 if TYPE_CHECKING:
     from collections.abc import Callable
     from pathlib import Path
-
-    from numpy.typing import NDArray
 
     from acquire.store.files import Disk
     from acquire.store.reader import Recording
@@ -167,7 +166,14 @@ class _Recoverer:
         recording = self.recording
         # Indices first, since chunks are found by them. Then committed rows, and only then the rows after
         # them, which count only if every array of both arms has them.
-        mended = sum(self._mend(arm) for arm in ARMS)
+        mended, first_shard = 0, self.first_row // self.shape.shard_rows
+        for arm, name in product(ARMS, COLUMNS):
+            reader = recording.arms[arm].reader(name)
+            mended += sum(
+                mend_index(self.disk, self.path, reader, shard, grow=not self.sealed)
+                for shard in shard_numbers(self.path / reader.key)
+                if shard >= first_shard
+            )
         scans = scan(recording, self.kept, progress)
         if not self.sealed:
             # Chunk after chunk of the tag arrays: the first one that is not whole, in any array of either
@@ -192,30 +198,21 @@ class _Recoverer:
             damage=damage,
         )
 
-    def _mend(self, arm: str) -> int:
-        """Mend the torn indices of an arm; return their number."""
-        stream = self.recording.arms[arm]
-        first_shard = self.first_row // self.shape.shard_rows
-        mended = 0
-        for name in COLUMNS:
-            reader = stream.reader(name)
-            mended += sum(
-                mend_index(self.disk, self.path, reader, shard, grow=not self.sealed)
-                for shard in shard_numbers(self.path / reader.key)
-                if shard >= first_shard
-            )
-        return mended
-
     def _flag(self, found: ArmScan) -> list[tuple[int, int, str]]:
         """Flag the lost rows of one arm; return the gaps to be listed: first line, count, cause."""
-        size = self.tag_rows
+        size, reader = self.tag_rows, found.stream.reader("flags")
         listed = sorted(self.recording.lost_rows(found.stream.arm, self.rows), key=lambda rows: rows.start)
         gaps: dict[str, list[tuple[int, int, str]]] = {"damaged": [], "unlisted": []}
         for chunk in chunks_of(size, [*self.kept, range(self.recording.lines, self.rows)]):
             here = range(chunk * size, min(self.rows, (chunk + 1) * size))
             lost = found.lost(range(here.start, here.start + size))  # a whole chunk, as it is rewritten
-            missing = self._flag_chunk(found, chunk, lost)[: len(here)] & ~covered(listed, here)
-            lost = lost[: len(here)]
+            damaged = chunk in found.troubles["flags"]
+            flags = np.zeros(size, reader.shape.dtype) if damaged else reader.chunk(chunk).copy()
+            if damaged or (lost & ~missing_rows(flags)).any():
+                flags[lost] |= np.uint16(LineFlag.MISSING)
+                rewrite_chunk(self.disk, self.path, reader, chunk, flags)
+                self.flags_changed += 1
+            missing, lost = missing_rows(flags)[: len(here)] & ~covered(listed, here), lost[: len(here)]
             for cause, rows in (("damaged", missing & lost), ("unlisted", missing & ~lost)):
                 for first, count in runs(rows, self.recording.first_line + here.start):
                     begin, known = first, gaps[cause]
@@ -224,17 +221,6 @@ class _Recoverer:
                         begin = known.pop()[0]
                     known.append((begin, first + count - begin, cause))
         return sorted(gap for of_cause in gaps.values() for gap in of_cause)
-
-    def _flag_chunk(self, found: ArmScan, chunk: int, lost: NDArray[np.bool_]) -> NDArray[np.bool_]:
-        """Return which rows of a chunk are missing, after flagging the ``lost`` ones on disk."""
-        reader = found.stream.reader("flags")
-        damaged = chunk in found.troubles["flags"]
-        flags = np.zeros(len(lost), reader.shape.dtype) if damaged else reader.chunk(chunk).copy()
-        if damaged or (lost & ~missing_rows(flags)).any():
-            flags[lost] |= np.uint16(LineFlag.MISSING)
-            rewrite_chunk(self.disk, self.path, reader, chunk, flags)
-            self.flags_changed += 1
-        return missing_rows(flags)
 
     def _publish(self, new_gaps: dict[str, list[tuple[int, int, str]]]) -> None:
         hidden = self.path / ARMS[0] / "lines"

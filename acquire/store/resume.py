@@ -80,7 +80,18 @@ def list_segments(path: Path, disk: Disk = DISK) -> None:
     if not first.is_dir():
         return
     with locked(first, "listing the segments of"):
-        _name(first, _segments_beside(first), disk)
+        run_id = read_root(LocalSource(first))["attributes"].get("run_id")
+        found = []
+        for beside in first.parent.glob(f"{escape(first.stem)}-*{escape(first.suffix)}"):
+            try:
+                attributes = read_root(LocalSource(beside))["attributes"]
+            except (DataError, PlaceError):
+                continue  # no recording, or a damaged one
+            # The file name proves nothing: a user may have called another recording NAME-2.
+            segment = segment_of(attributes)
+            if segment and (segment[0], attributes.get("run_id")) == (first.name, run_id):
+                found.append((segment[1], beside.name))
+        _name(first, [name for _, name in sorted(found)], disk)
 
 
 def _name(first: Path, segments: list[str], disk: Disk) -> None:
@@ -96,22 +107,6 @@ def _name(first: Path, segments: list[str], disk: Disk) -> None:
         document["attributes"]["segments"] = sorted([*listed, *new], key=lambda name: (len(name), name))
         publisher = Publisher(first / ARMS[0] / "lines" / SCRATCH, disk)
         publisher.replace(first / "zarr.json", to_json(document), durable=True)
-
-
-def _segments_beside(first: Path) -> list[str]:
-    """Return the names of recordings whose attributes name this one as their first, in order."""
-    run_id = read_root(LocalSource(first))["attributes"].get("run_id")
-    found = []
-    for path in first.parent.glob(f"{escape(first.stem)}-*{escape(first.suffix)}"):
-        try:
-            attributes = read_root(LocalSource(path))["attributes"]
-        except (DataError, PlaceError):
-            continue  # no recording, or a damaged one
-        # The file name proves nothing: a user may have called another recording NAME-2.
-        segment = segment_of(attributes)
-        if segment and (segment[0], attributes.get("run_id")) == (first.name, run_id):
-            found.append((segment[1], path.name))
-    return [name for _, name in sorted(found)]
 
 
 def _check_alike(first: Recording, spec: RecordingSpec) -> None:

@@ -27,7 +27,6 @@ if TYPE_CHECKING:
 
     from acquire.store.reader import Recording
     from acquire.store.scan import ArmScan
-    from acquire.store.source import Source
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,29 +79,24 @@ def verify(place: Path | str, progress: Callable[[int, int], None] | None = None
     if isinstance(source, LocalSource):
         refuse_links(source.path)
     with refused(source, "read"):
-        return _verified(open_source(source), source, progress)
-
-
-def _verified(
-    recording: Recording, source: Source, progress: Callable[[int, int], None] | None
-) -> Verification:
-    scans = scan(recording, recording.kept_rows(), progress)
-    gone = open_source(source).dropped  # lines that retention deleted during the scan are not damaged
-    damage = tuple(
-        found
-        for arm in scans.values()
-        for found in arm.damages(recording.lines)
-        if not any(first <= found.first_line < first + count for first, count in gone)
-    )
-    return Verification(
-        path=str(source),
-        state=recording.state,
-        lines=recording.lines,
-        bytes=source.total_bytes(),
-        damage=damage,
-        contradictions=tuple(_contradictions(recording, scans)),
-        notes=tuple(_notes(recording)),
-    )
+        recording = open_source(source)
+        scans = scan(recording, recording.kept_rows(), progress)
+        gone = open_source(source).dropped  # lines that retention deleted during the scan are not damaged
+        damage = tuple(
+            found
+            for arm in scans.values()
+            for found in arm.damages(recording.lines)
+            if not any(first <= found.first_line < first + count for first, count in gone)
+        )
+        return Verification(
+            path=str(source),
+            state=recording.state,
+            lines=recording.lines,
+            bytes=source.total_bytes(),
+            damage=damage,
+            contradictions=tuple(_contradictions(recording, scans)),
+            notes=tuple(_notes(recording)),
+        )
 
 
 def _contradictions(recording: Recording, scans: dict[str, ArmScan]) -> Iterator[str]:

@@ -65,13 +65,15 @@ class VideoWriter:
             chunk = shape if tile_side is None else (tile_side, tile_side)
             frames = max(1, CHUNK_BYTES // (chunk[0] * chunk[1] * dtype.itemsize))
             self._levels = [
-                _image(
-                    self._group,
+                self._group.create_array(
                     str(number),
-                    each,
-                    chunk=(frames, min(chunk[0], each[0]), min(chunk[1], each[1])),
+                    shape=(0, *each),
                     dtype=dtype,
+                    # as many frames at every level
+                    chunks=(frames, min(chunk[0], each[0]), min(chunk[1], each[1])),
                     fill_value=fill_value,
+                    compressors=_packed(),
+                    dimension_names=("t", "y", "x"),
                 )
                 for number, each in enumerate(layout.level_shapes(shape))
             ]
@@ -193,26 +195,6 @@ def _append(array: zarr.Array[Any], values: NDArray[Any]) -> None:
     first = array.shape[0]
     array.resize((first + len(values), *array.shape[1:]))
     array[first:] = values
-
-
-def _image(
-    group: zarr.Group,
-    name: str,
-    shape: tuple[int, int],
-    chunk: tuple[int, int, int],
-    dtype: np.dtype[Any],
-    fill_value: float,
-) -> zarr.Array[Any]:
-    """Create a level with frames of a shape; chunks of all levels have equally many frames."""
-    return group.create_array(
-        name,
-        shape=(0, *shape),
-        dtype=dtype,
-        chunks=chunk,
-        fill_value=fill_value,
-        compressors=_packed(),
-        dimension_names=("t", "y", "x"),
-    )
 
 
 def _column(group: zarr.Group, name: str, dtype: str, attributes: dict[str, Any]) -> zarr.Array[Any]:

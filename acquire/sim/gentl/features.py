@@ -87,8 +87,16 @@ class Module:
             )
         space = bytearray(PORT_BYTES)
         for feature in self.features.values():
+            if feature.kind == "text":
+                # a text ends with a zero
+                value = str(feature.value).encode()[: TEXT_BYTES - 1]
+            elif feature.kind == "float":
+                value = struct.pack("<d", float(feature.value))
+            elif feature.kind == "enum":
+                value = struct.pack("<Q", feature.entries[str(feature.value)])
+            else:
+                value = struct.pack("<Q", int(feature.value))
             for copy in range(self._copies(feature)):
-                value = _encode(feature)
                 at = feature.at + copy * feature.size
                 space[at : at + len(value)] = value
         space[URL_AT : URL_AT + len(url)] = url
@@ -219,15 +227,3 @@ def _common(feature: Feature) -> str:
     tip = f"<ToolTip>{escape(feature.tip)}</ToolTip>" if feature.tip else ""
     locked = "<pIsLocked>TLParamsLockedReg</pIsLocked>" if feature.locked else ""
     return f"{tip}<DisplayName>{feature.name}</DisplayName>{locked}"
-
-
-def _encode(feature: Feature) -> bytes:
-    """Return the bytes of a feature's register."""
-    value = feature.value
-    if feature.kind == "text":
-        # a text ends with a zero
-        return str(value).encode()[: TEXT_BYTES - 1]
-    if feature.kind == "float":
-        return struct.pack("<d", float(value))
-    number = feature.entries[str(value)] if feature.kind == "enum" else int(value)
-    return struct.pack("<Q", number)

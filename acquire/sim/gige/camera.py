@@ -136,7 +136,15 @@ class GigeCamera:
         if (sender, request) != self._answered[:2]:
             before = self._registers.memory[_IMAGE_REGISTERS]
             result = self._registers.handle(request)
-            if self._has_valid_image():
+            width = self._register("Width")
+            # A host need not keep to the description of the registers.
+            is_valid = (
+                self._register("PixelFormat") in self._formats
+                and width > 0
+                and self._register("OffsetX") + width <= self._sensor_width
+                and self._register("Height") > 0
+            )
+            if is_valid:
                 # Before the answer is sent: the host may start the trigger as soon as it has the answer.
                 self._apply_registers()
             else:
@@ -146,16 +154,6 @@ class GigeCamera:
         reply = self._answered[2]
         if reply is not None:
             self._control[0].sendto(reply, sender)
-
-    def _has_valid_image(self) -> bool:
-        """Return whether lines can be sent as the registers say: a host need not keep to the description."""
-        width = self._register("Width")
-        return (
-            self._register("PixelFormat") in self._formats
-            and width > 0
-            and self._register("OffsetX") + width <= self._sensor_width
-            and self._register("Height") > 0
-        )
 
     def _apply_registers(self) -> None:
         """Carry out the commands that the host has set in registers; they read back as 0 once done."""
