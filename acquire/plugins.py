@@ -17,6 +17,7 @@ import importlib
 import inspect
 import sys
 import tomllib
+import traceback
 from dataclasses import dataclass, replace
 from functools import cache
 from importlib import metadata
@@ -119,7 +120,9 @@ class Group:
 
     def _listed(self, without: str = "") -> str:
         """List the names that can be requested, with their origin unless they are ours."""
-        usable = [plugin for plugin in self.found() if not plugin.refused and plugin.name != without]
+        named = [plugin for plugin in self.found() if not plugin.refused and plugin.name != without]
+        # Ours are not imported for a list: what they lack is an extra, which the error then names.
+        usable = [each for each in named if each.distribution == OURS or not self.trouble(each)]
         return ", ".join(
             each.name if each.distribution == OURS else f"{each.name} ({each.origin})" for each in usable
         )
@@ -203,6 +206,8 @@ def _unsuitable(group: Group, entry: metadata.EntryPoint, loaded: Any) -> str:
     """Return why ``loaded`` is not what the group needs, or an empty text."""
     module, _, name = group.base.partition(":")
     base = getattr(importlib.import_module(module), name)
+    if group is DENOISERS:
+        return _unsuitable_denoiser(entry, loaded)
     if not (isinstance(loaded, type) and issubclass(loaded, base)):
         return f"{entry.value} is not a class that extends {module}.{name}"
     if missing := sorted(getattr(loaded, "__abstractmethods__", ())):
@@ -210,6 +215,17 @@ def _unsuitable(group: Group, entry: metadata.EntryPoint, loaded: Any) -> str:
     kind = getattr(loaded, "model_fields", {}).get("kind")
     if kind is not None and get_args(kind.annotation) != (entry.name,):
         return f"{entry.value} needs kind: Literal[{entry.name!r}], the name of its entry point"
+    flaw: str = getattr(loaded, "flaw", str)()
+    return f"{entry.value} {flaw}" if flaw else ""
+
+
+def _unsuitable_denoiser(entry: metadata.EntryPoint, loaded: Any) -> str:
+    if not (isinstance(loaded, type) and callable(getattr(loaded, "prox", None))):
+        return f"{entry.value} is not a class with a method prox(frames, weight)"
+    try:
+        inspect.signature(loaded).bind()
+    except TypeError as error:
+        return f"{entry.value} cannot be made without arguments: {error}"
     return ""
 
 
@@ -224,6 +240,28 @@ def _hint_for_unknown(group: str, name: str) -> str:
     if name in listed or (listed and not _found_ours(group)):
         return f"pip install -e . --no-deps in {root}: its pyproject.toml is newer than the installation"
     return "acquire plugins"
+
+
+def raised_by(error: BaseException) -> str:
+    """Return the module and distribution of somebody else's plug-in in which an error arose; else empty."""
+    files = {frame.filename for frame in traceback.extract_tb(error.__traceback__)}
+    for group in GROUPS:
+        for plugin in group.found():
+            module = sys.modules.get(plugin.entry.module) if plugin.distribution != OURS else None
+            if getattr(module, "__file__", None) in files:
+                return f"{plugin.entry.module} of {plugin.origin}"
+    return ""
+
+
+def unknown_groups() -> dict[str, list[str]]:
+    """Return groups of entry points named like ours that do not exist → the distributions that have them."""
+    known = {group.name for group in GROUPS}
+    found: dict[str, list[str]] = {}
+    for distribution in metadata.distributions():
+        for group in {entry.group for entry in distribution.entry_points} - known:
+            if group.startswith("acquire."):
+                found.setdefault(group, []).append(distribution.name)
+    return found
 
 
 def described(loaded: Any) -> str:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any, Self, cast
 
-from acquire.errors import ConfigError, UsageError
+from acquire.errors import AcquireError, ConfigError, TriggerError, UsageError
 from acquire.lines import ARMS
 
 if TYPE_CHECKING:
@@ -17,7 +17,6 @@ if TYPE_CHECKING:
     from acquire.camera.base import CameraOpener
     from acquire.camera.variant import CameraVariant
     from acquire.config import RigConfig
-    from acquire.config.device import TriggerConfig
     from acquire.sim.instrument import SimulatedDevices
     from acquire.sim.scene import Scene
     from acquire.trigger.base import Trigger
@@ -41,7 +40,13 @@ class Rig:
 
             self._simulated = SimulatedDevices(config)
         self._closed = False
-        self.trigger: Trigger = _trigger(config).open(config, self._simulated)
+        try:
+            self.trigger: Trigger = _trigger(config).open(config, self._simulated)
+        except AcquireError:
+            raise
+        except Exception as error:  # somebody else's driver may fail in any way
+            what = f"trigger driver {config.trigger.driver!r} failed to open"
+            raise TriggerError(f"{what}: {type(error).__name__}: {error}") from error
 
     def openers(self) -> dict[str, CameraOpener]:
         """Return arm → opener of its camera, for use here or in a child process."""
@@ -99,7 +104,7 @@ class Rig:
 def check_rig(config: RigConfig) -> None:
     """Raise ConfigError for settings that no trigger, or not the rig's simulated cameras, can honour."""
     trigger = config.trigger
-    if config.simulation.replay is not None and trigger.driver != "simulated":
+    if config.simulation.replay is not None and not _trigger(config).has_exact_light:
         raise ConfigError(f"a replay cannot have trigger.driver = {trigger.driver!r}", possible="'simulated'")
     if not _trigger(config).simulated and config.simulation.speed != 1:
         raise ConfigError(
@@ -109,19 +114,24 @@ def check_rig(config: RigConfig) -> None:
         )
     _trigger(config).check(config)
     if config.simulates_cameras:
-        _check_simulated_cameras(trigger, simulated=_trigger(config).simulated)
+        _check_simulated_cameras(config)
 
 
-def _check_simulated_cameras(trigger: TriggerConfig, *, simulated: bool) -> None:
+def _check_simulated_cameras(config: RigConfig) -> None:
     """Refuse trigger settings that simulated cameras would ignore.
 
     They only receive the line starts and the code of the light, and a simulated trigger has no inputs.
     """
-    # Of the gateware's pins, cameras see for each sub-step whether it was lit for most of it.
-    on_pins = trigger.driver != "simulated"
+    trigger, variant = config.trigger, _trigger(config)
+    if not variant.simulated:
+        drivers = ", ".join(sorted({config.cameras.arm(arm).driver for arm in ARMS}))
+        raise ConfigError(
+            f"simulated cameras ({drivers}) cannot be triggered by trigger.driver = {trigger.driver!r}",
+            possible="a simulated trigger, such as 'simulated'",
+        )
+    on_pins = not variant.has_exact_light
     pulsed, leads = trigger.lit_part != (0.0, 1.0), trigger.light.lead_ticks != 0
     for ignored, key, possible in (
-        (not simulated, f"driver = {trigger.driver!r}", "'simulated'"),
         (trigger.external_start != "off", f"external_start = {trigger.external_start!r}", "'off'"),
         (trigger.line_start != "per-line", f"line_start = {trigger.line_start!r}", "'per-line'"),
         (not trigger.a.enable, "a.enable = false", "true"),

@@ -10,11 +10,12 @@ from pathlib import Path
 
 
 def install(folder: Path, target: Path, wheels: Path) -> None:
-    """The distribution of a folder (pyproject.toml, one module) into ``target``, as ``pip install`` does.
+    """The distribution of a folder (pyproject.toml and its modules) into ``target``, as ``pip install`` does.
 
     The wheel holds what hatchling would pack: a build backend is not among what the tests install.
     """
-    project = tomllib.loads((folder / "pyproject.toml").read_text())["project"]
+    document = tomllib.loads((folder / "pyproject.toml").read_text())
+    project = document["project"]
     name = project["name"].replace("-", "_")
     about = f"{name}-{project['version']}.dist-info"
     groups = "".join(
@@ -22,7 +23,10 @@ def install(folder: Path, target: Path, wheels: Path) -> None:
         for group, entries in project["entry-points"].items()
     )
     files = {
-        f"{name}.py": (folder / f"{name}.py").read_text(),
+        **{
+            file: (folder / file).read_text()
+            for file in document["tool"]["hatch"]["build"]["targets"]["wheel"]["only-include"]
+        },
         f"{about}/METADATA": f"Metadata-Version: 2.1\nName: {project['name']}\n"
         f"Version: {project['version']}\n",
         f"{about}/WHEEL": "Wheel-Version: 1.0\nGenerator: tests\nRoot-Is-Purelib: true\nTag: py3-none-any\n",

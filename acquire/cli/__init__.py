@@ -74,6 +74,13 @@ def _carry_out() -> int:
     # Without a message: `interrupts_handled` has acknowledged it.
     except KeyboardInterrupt:
         return EXIT_INTERRUPTED
+    # A defect: with its traceback, and with the name of whoever can mend it, if that is not us.
+    except Exception as error:
+        from acquire.plugins import raised_by
+
+        if module := raised_by(error):
+            error.add_note(f"This error arose in a plug-in: {module}.")
+        raise
 
 
 def _is_full(stream: TextIO) -> bool:

@@ -26,7 +26,7 @@ def plugins(json: JsonFlag = False) -> None:
 
     Example: [bold]acquire plugins[/]
     """
-    from acquire.plugins import GROUPS, OURS, described
+    from acquire.plugins import GROUPS, OURS, described, unknown_groups
 
     rows = []
     for group in GROUPS:
@@ -57,3 +57,6 @@ def plugins(json: JsonFlag = False) -> None:
     for row in rows:
         if row["error"]:
             say(f"{row['kind']} {row['name']} of {row['distribution']} {row['version']}: {row['error']}")
+    for unknown, distributions in unknown_groups().items():
+        possible = ", ".join(each.name for each in GROUPS)
+        say(f"{', '.join(distributions)}: there is no group {unknown}; possible: {possible}")

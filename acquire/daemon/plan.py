@@ -86,7 +86,10 @@ class Run:
             clock=self.capture.clock,
             code=config.code.build().to_attrs(),
             substep_ticks=config.trigger.substep_ticks,
-            trigger={**asdict(self._rig.trigger.identify()), "settings": config.trigger.model_dump()},
+            trigger={
+                **asdict(self._rig.trigger.identify()),
+                "settings": config.trigger.model_dump(mode="json"),
+            },
             cameras={arm: self._camera(arm, facts) for arm, facts in self.capture.cameras.items()},
             config=config.model_dump(mode="json"),
             extra=self._rig.describe()

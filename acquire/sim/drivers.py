@@ -63,6 +63,7 @@ class SimulatedTrigger(GatewareTrigger):
     """A model of the gateware, in this process."""
 
     simulated: ClassVar[bool] = True
+    has_exact_light: ClassVar[bool] = True
 
     def transport(self, config: RigConfig, bench: SimulatedDevices | None) -> Callable[[], Transport]:
         from acquire.sim.instrument import unconnected_transport
@@ -77,6 +78,8 @@ class SimulatedTrigger(GatewareTrigger):
 
 class CompiledTrigger(SimulatedTrigger):
     """The gateware itself, compiled, with pins that the simulated cameras read."""
+
+    has_exact_light: ClassVar[bool] = False
 
     def bytes_per_s(self, trigger: TriggerConfig) -> float:
         from acquire.sim import rtl

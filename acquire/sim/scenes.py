@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Literal, Self, cast
 
+import numpy as np
 from pydantic import Field, model_validator
 
 from acquire.config.scene import OpticsConfig, SceneConfig
+from acquire.errors import UsageError
 from acquire.sim.scene import SceneModel, add
 
 if TYPE_CHECKING:
@@ -22,6 +24,11 @@ def build_scene(config: SceneBase, size: int, substep_s: float) -> Scene:
     Raises UsageError for files, pictures and functions that do not make a scene.
     """
     scene = cast("SceneModel", config).build(size, substep_s)
+    shape = np.shape(scene.frames(0, 1))
+    if shape != (1, size, size):
+        raise UsageError(
+            f"scene {config.kind!r} gave back a frame of shape {shape[1:]}", possible=f"{size} × {size}"
+        )
     if not config.shutters:
         return scene
     from acquire.sim.shutters import ShutteredScene, build_shutter

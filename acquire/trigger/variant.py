@@ -26,9 +26,12 @@ class TriggerVariant(FrozenModel, ABC):
     """A driver with its options (``[trigger.options]``), none by default. Named by an entry point.
 
     ``simulated``: its pulses reach simulated cameras, and its time may run at another speed.
+    ``has_exact_light``: it passes the light's lead and window on to simulated cameras, and can pace a replay;
+    of any other, these cameras only see for each sub-step whether it was lit for most of it.
     """
 
     simulated: ClassVar[bool] = False
+    has_exact_light: ClassVar[bool] = False
 
     @abstractmethod
     def open(self, config: RigConfig, bench: Any) -> Trigger:

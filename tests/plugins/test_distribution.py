@@ -98,10 +98,50 @@ def test_what_is_there_is_listed_with_whose_it_is_and_what_is_broken_with_its_er
         ("denoiser", "local-wiener"),
     }
     assert all(row["works"] and row["version"] == "0.3" and row["about"] for row in theirs.values())
-    broken = [row for row in rows if not row["works"]]
-    assert {row["name"] for row in broken} == {"haze", "haze-free"}
-    assert all("No module named 'library_that_nobody_installed'" in row["error"] for row in broken)
+    broken = {row["name"]: row["error"] for row in rows if not row["works"]}
+    assert set(broken) == {"haze", "haze-free", "nowhere", "no-prox", "needs-argument"}
+    for name in ("haze", "haze-free"):
+        assert "No module named 'library_that_nobody_installed'" in broken[name]
+    assert broken["nowhere"].startswith("lab_careless:Nowhere needs place: one of light, image,")
+    assert broken["no-prox"] == "lab_careless:NoProx is not a class with a method prox(frames, weight)"
+    assert "cannot be made without arguments: missing a required" in broken["needs-argument"]
     assert sum(row["distribution"] == "tdi-acquire" for row in rows) >= 45
+
+
+def test_a_misspelt_group_is_named(acquire: Run) -> None:
+    """Its plug-ins were absent from the list, without a word."""
+    assert (
+        "lab-broken: there is no group acquire.effect; possible: acquire.effects" in acquire("plugins").stdout
+    )
+
+
+@pytest.mark.parametrize(
+    ("scene", "effect", "code", "told"),
+    [
+        ("oblong", "", 2, "scene 'oblong' gave back a frame of shape (16, 15)\n  possible: 16 × 16"),
+        ("stars", "short", 2, "effect short gave back shape (255, 8) for lines of shape (256, 8)"),
+        ("stars", "raises", 1, "This error arose in a plug-in: lab_careless of lab-broken 0.1."),
+    ],
+)
+def test_mistakes_in_use_are_named_with_the_plug_in(
+    acquire: Run, tmp_path: Path, scene: str, effect: str, code: int, told: str
+) -> None:
+    effects = f'[[effects]]\nkind = "{effect}"\n' if effect else ""
+    (tmp_path / "scene.toml").write_text(f'kind = "{scene}"\n{effects}')
+    made = acquire("simulate", "scene.toml", "--config", "rig.toml", "--lines", "300", "--out", "x.zarr")
+    assert made.returncode == code
+    assert told in made.stderr
+
+
+def test_a_trigger_derived_from_the_simulated_one_supports_what_that_supports(
+    acquire: Run, tmp_path: Path
+) -> None:
+    """The window and the lead of the light were refused, by the trigger's name."""
+    trigger = 'driver = "slow-link"\nlight = { lead_ticks = 45, open_ticks = 90 }'
+    rig = RIG.format(driver="").replace("[trigger]\n", f"[trigger]\n{trigger}\n")
+    (tmp_path / "slow.toml").write_text(rig)
+    checked = acquire("config", "check", "slow.toml")
+    assert checked.returncode == 0, checked.stderr
 
 
 def test_the_doctor_names_those_that_are_broken(acquire: Run) -> None:

@@ -92,6 +92,11 @@ class Effect(EffectConfig, ABC):
     place: ClassVar[Place]
     rank: ClassVar[float] = 1000
 
+    @classmethod
+    def flaw(cls) -> str:
+        """Return what the class lacks, as the rest of a sentence; empty if nothing."""
+        return "" if getattr(cls, "place", None) in PLACES else f"needs place: one of {', '.join(PLACES)}"
+
     @abstractmethod
     def stages(self, setting: Setting) -> list[Stage]:
         """Return its stages for one arm, none if it does not act there. Equal settings give equal stages."""

@@ -1,3 +1,3 @@
-"""A plug-in whose own library was forgotten."""
+"""Plug-ins whose own library was forgotten."""
 
 import library_that_nobody_installed  # noqa: F401
