@@ -163,11 +163,11 @@ class Host:
     # ---- the end
 
     def failures_in_log(self) -> list[str]:
-        """Unforeseen failures."""
+        """Unforeseen failures, with the last one's text: the log's directory is temporary."""
         text = self._log.read_text(errors="replace")
-        return (
-            [f"the log has {text.count('Traceback')} tracebacks: {self._log}"] if "Traceback" in text else []
-        )
+        count, last = text.count("Traceback"), text.rfind("Traceback")
+        begin = text.rfind("\n", 0, text.rfind("\n", 0, last))
+        return [f"the log has {count} tracebacks; the last one:{text[begin : last + 4000]}"] if count else []
 
     def judge(self) -> list[str]:
         """Memory of long lives; descriptors and threads compared with those of new processes."""
