@@ -59,4 +59,5 @@ _HOMES = {
 }
 """Public name → the package that defines it, imported on first use since each brings its libraries."""
 
-__getattr__, __dir__ = lazily(__name__, _HOMES, __all__)
+if not TYPE_CHECKING:  # a type checker would accept any name
+    __getattr__, __dir__ = lazily(__name__, _HOMES, __all__)

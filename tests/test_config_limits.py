@@ -295,3 +295,10 @@ def test_a_file_in_a_directory_that_may_not_be_entered_is_not_said_to_be_missing
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert "does not exist" not in done.stdout
     assert "may not enter" in done.stdout or "Permission denied" in done.stdout
+
+
+def test_a_complete_rig_file_from_before_replays_had_a_gate_is_read():
+    """`config show` wrote every key, also this one, which is gone."""
+    assert load_rig("rig-demo", {"simulation.replay_hold_s": 0.0}).name == "demo"
+    with pytest.raises(ConfigError, match="replay_hold_s is gone; possible: replay_gate"):
+        load_rig("rig-demo", {"simulation.replay_hold_s": 2.0})

@@ -47,4 +47,5 @@ _HOMES = {
     "save_calibration": "file",
 }
 
-__getattr__, __dir__ = lazily(__name__, _HOMES, __all__)
+if not TYPE_CHECKING:  # a type checker would accept any name
+    __getattr__, __dir__ = lazily(__name__, _HOMES, __all__)

@@ -81,7 +81,6 @@ def snapshot(
     Example: [bold]acquire camera snapshot SIM-A --config rig-demo --lines 500[/]
     """
     import numpy as np
-    from PIL import Image
 
     from acquire.camera.look import snapshot as take
     from acquire.camera.visit import visit
@@ -91,6 +90,9 @@ def snapshot(
     path = out or Path(f"{serial}.png")
     # Before the camera is opened, which takes long.
     _check_out(path)
+    is_picture = path.suffix.lower() == ".png"
+    if is_picture:
+        from PIL import Image  # an extra, which a capture host may not have
     with Bench(config) as bench:
         seconds = OPEN_S + lines / bench.line_rate_hz
         # `armed`: the trigger starts only once the camera waits for its pulses.
@@ -98,7 +100,7 @@ def snapshot(
             bench.opener(serial), take, lines, seconds, timeout_s=2 * OPEN_S + seconds, armed=bench.pulse
         )
     with whole_file(path) as part, refused(path, "written"), part.open("wb") as file:
-        if path.suffix.lower() == ".npy":
+        if not is_picture:
             np.save(file, pixels)
         else:
             # A picture of a single value has no span to be divided by.

@@ -12,6 +12,7 @@ import shutil
 from typing import TYPE_CHECKING, Any
 
 from acquire.config.device import PIXEL_BITS
+from acquire.config.rig import MOST_TAGS_PER_S
 from acquire.errors import UsageError
 from acquire.lines import ARMS
 
@@ -43,6 +44,7 @@ def replay_rig(stored: Recording, speed: float, directory: Path, **simulation: A
             f"{stored} cannot be replayed: its lines have {geometry['pixels']} pixels",
             possible=f"as many pixels as stages, {geometry['stages']}",
         )
+    line_period_ticks = stored.attrs["trigger"]["line_period_ticks"]
     code = replay_code(stored).to_attrs()  # from the first recorded line on
     keys = ("degree", "state") if code["kind"] == "prbs" else ("value",)
     substeps = stored.substeps
@@ -59,9 +61,12 @@ def replay_rig(stored: Recording, speed: float, directory: Path, **simulation: A
         },
         "trigger": {
             "clock_hz": stored.clock.clock_hz,
-            "substep_ticks": stored.attrs["trigger"]["line_period_ticks"] // substeps,
-            # A rig file allows at most a third of the ring.
-            "tag_every_lines": max(1, min(256, slots * block // 4)),
+            "substep_ticks": line_period_ticks // substeps,
+            # A rig file allows at most a third of the ring, and only as many tags as the host can read.
+            "tag_every_lines": max(
+                min(256, slots * block // 4),
+                math.ceil(speed * stored.clock.clock_hz / line_period_ticks / MOST_TAGS_PER_S),
+            ),
         },
         "cameras": {arm: _camera(stored, arm) for arm in ARMS},
         "stream": {"block_lines": block, "ring_slots": slots, "reopen_s": PATIENCE_S},

@@ -34,4 +34,5 @@ if TYPE_CHECKING:
 __all__ = ["SEALED", "AsyncClient", "Client", "EventReader", "Health", "News", "Setup", "State", "Status"]
 
 # Lazy, so that the command line, which makes one call and exits, does not import asyncio.
-__getattr__, __dir__ = lazily(__name__, {"AsyncClient": "asynchronous"}, __all__)
+if not TYPE_CHECKING:  # a type checker would accept any name
+    __getattr__, __dir__ = lazily(__name__, {"AsyncClient": "asynchronous"}, __all__)

@@ -140,7 +140,11 @@ class Call(Generic[T]):
 
     @property
     def content(self) -> bytes | None:
-        return None if self.body is None else json.dumps(self.body.model_dump(mode="json")).encode()
+        if self.body is None:
+            return None
+        # Without what is left at its default: a daemon from before an upgrade need not know options that
+        # nobody has used.
+        return json.dumps(self.body.model_dump(mode="json", exclude_defaults=True)).encode()
 
     def headers(self, target: Target) -> dict[str, str]:
         # Each call has its own connection, of which the daemon keeps only a few open.

@@ -146,6 +146,16 @@ class SimulationConfig(FrozenModel):
         default=None, description="a file; no replayed line comes before it exists"
     )
 
+    @model_validator(mode="before")
+    @classmethod
+    def _drop_replay_hold(cls, table: Any) -> Any:
+        """Drop a key that rig files had until replays got a gate, where it has no effect."""
+        if not isinstance(table, dict) or "replay_hold_s" not in table:
+            return table
+        if table["replay_hold_s"] != 0:
+            raise ValueError("replay_hold_s is gone; possible: replay_gate, a file for which a replay waits")
+        return {key: value for key, value in table.items() if key != "replay_hold_s"}
+
 
 def _is_recorded(info: ValidationInfo) -> bool:
     """Whether the rig is that of a recording, whose lines are only read."""

@@ -181,10 +181,11 @@ class Outline:
     def info(self) -> dict[str, Any]:
         """Return a summary of the recording, as JSON."""
         period_ns, lines = self.line_period_ns, self.lines
-        keys = ("run_id", "state", "run_condition", "end_reason", "layout", "geometry", "code", "clock")
+        keys = ("run_id", "state", "run_condition", "end_reason", "layout", "geometry", "clock")
         return {
             "path": str(self),
             **{key: self.attrs[key] for key in keys},
+            "code": self._code_facts(),
             "first_line": self.first_line,
             "lines": lines,
             "first_available_line": self.first_available_line,
@@ -210,6 +211,14 @@ class Outline:
             "durability": self.attrs.get("durability", {}),
             "versions": self.attrs["versions"],
         }
+
+    def _code_facts(self) -> dict[str, Any]:
+        """Return the code; of format 1, which calls the register's state ``seed``, by today's names."""
+        code: dict[str, Any] = self.attrs["code"]
+        if code["kind"] != "prbs" or "state" in code:
+            return code
+        seed = self.attrs.get("config", {}).get("code", {}).get("seed")
+        return code | {"state": code["seed"], "seed": seed}
 
     def _disk_facts(self) -> dict[str, float] | None:
         """Return, of a local growing recording, bytes free, bytes per second, and seconds to a full disk."""

@@ -17,6 +17,7 @@ from dataclasses import replace
 from glob import escape
 from typing import TYPE_CHECKING
 
+from acquire.codes import code_from_attrs
 from acquire.errors import DataError, PlaceError, UsageError
 from acquire.lines import ARMS
 from acquire.store.attributes import segment_of
@@ -110,16 +111,16 @@ def _name(first: Path, segments: list[str], disk: Disk) -> None:
 
 
 def _check_alike(first: Recording, spec: RecordingSpec) -> None:
-    asked = {
-        "geometry": spec.geometry,
-        "code": spec.code,
-        "layout": spec.layout,
-    }
-    for key, value in asked.items():
-        if first.attrs[key] != value:
-            raise UsageError(
-                f"resuming {first} needs the same {key}, not {value}", possible=str(first.attrs[key])
-            )
+    known = first.attrs
+    # One code can be given by its seed or by its state, and format 1 has only the state.
+    has_same_code = code_from_attrs(known["code"]) == code_from_attrs(spec.code)
+    for key, value, is_same in (
+        ("geometry", spec.geometry, known["geometry"] == spec.geometry),
+        ("code", spec.code, has_same_code),
+        ("layout", spec.layout, known["layout"] == spec.layout),
+    ):
+        if not is_same:
+            raise UsageError(f"resuming {first} needs the same {key}, not {value}", possible=str(known[key]))
     if first.arms[ARMS[0]].dtype != spec.line_dtype:
         raise UsageError(
             f"resuming {first} needs the same samples, not {spec.dtype}",

@@ -52,4 +52,5 @@ __all__ = [
     "TriggerContract",
     "assert_adjoint",
 ]
-__getattr__, __dir__ = lazily(__name__, _HOMES, __all__)
+if not TYPE_CHECKING:  # a type checker would accept any name
+    __getattr__, __dir__ = lazily(__name__, _HOMES, __all__)

@@ -20,7 +20,16 @@ from store_helpers import CLOCK, Truth, check_rows, fill, make_spec
 from acquire import store
 from acquire.errors import DataError, PlaceError, UsageError
 from acquire.lines import ARMS, LineFlag
-from acquire.store import FORMAT, Event, Gap, RecordingWriter, RunCondition, open_recording, verify
+from acquire.store import (
+    FORMAT,
+    Event,
+    Gap,
+    RecordingWriter,
+    RunCondition,
+    next_segment,
+    open_recording,
+    verify,
+)
 
 
 @pytest.fixture
@@ -382,6 +391,10 @@ def test_a_recording_of_format_1_opens_and_has_the_same_code(path):
     assert recording.attrs["format"] == "acquire-recording/1"
     np.testing.assert_array_equal(recording.cut(1000, 100).code, code)
     assert (verify(path).damage, verify(path).contradictions) == ((), ())
+    place, _ = next_segment(path, make_spec())
+    assert place.name == f"{path.stem}-2.zarr"
+    known = recording.info()["code"]
+    assert (known["state"], known["seed"]) == (make_spec().code["state"], None)
 
 
 def test_what_the_package_offers_is_what_is_asked_for():

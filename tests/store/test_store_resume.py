@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from store_helpers import Truth, fill, make_spec
 
+from acquire.codes import PrbsCode
 from acquire.errors import StateError, UsageError
 from acquire.store import (
     Continuation,
@@ -97,11 +98,27 @@ def test_a_trigger_that_began_anew_is_told(killed):
     assert open_recording(killed).cut(1000, 40).first_line == 1000
 
 
-@pytest.mark.parametrize("changes", [{"pixels": 16}, {"dtype": "uint8"}, {"layout": "compact"}])
+OTHER_CODE = PrbsCode(64, 99).to_attrs()
+
+
+@pytest.mark.parametrize(
+    "changes", [{"pixels": 16}, {"dtype": "uint8"}, {"layout": "compact"}, {"code": OTHER_CODE}]
+)
 def test_lines_of_another_kind_are_no_segment(killed, changes):
     recover(killed)
     with pytest.raises(UsageError, match="resuming"):
         next_segment(killed, make_spec(**changes))
+
+
+def test_a_code_given_by_its_seed_continues_the_same_one_given_by_its_state(killed):
+    recover(killed)
+    code = PrbsCode.from_seed(64, 5)
+    first = killed.with_name("by-seed.zarr")
+    with RecordingWriter.create(first, make_spec(code=code.to_attrs())) as writer:
+        fill(writer, 85)
+        writer.seal(RunCondition.GOOD, "done", {})
+    place, _ = next_segment(first, make_spec(code=PrbsCode(64, code.state).to_attrs()))
+    assert place.name == "by-seed-2.zarr"
 
 
 def test_a_segment_is_resumed_through_the_first(killed):
