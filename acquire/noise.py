@@ -17,6 +17,14 @@ QUANTISATION_DN2 = 1 / 12
 """Variance of rounding to whole DN."""
 
 
+def robust_sigma(deviations: NDArray[Any]) -> float:
+    """Return the standard deviation of normal noise with this median of absolute values.
+
+    Outliers hardly change it.
+    """
+    return float(1.4826 * np.median(np.abs(deviations)))
+
+
 @dataclass(frozen=True, slots=True)
 class Noise:
     """σ² = σ_q² + σ_d² + K·(light in DN), EMVA 1288 release 4.0, Eq. (9) with K·σ_d in DN.

@@ -269,11 +269,11 @@ class Calibration:
             self.instrument,
             {name: self.quantities[name] for name in FOUND_BY.get(step, ()) if name in self.quantities},
             usable,
-            self.orientation if step == "orientation" else None,
-            self.alignment if step == "align" else None,
-            facts,
-            tuple(facts.get("warnings", ())),
-            self.tiles if step == "align" else (),
+            orientation=self.orientation if step == "orientation" else None,
+            alignment=self.alignment if step == "align" else None,
+            facts=facts,
+            warnings=tuple(facts.get("warnings", ())),
+            tiles=self.tiles if step == "align" else (),
         )
 
     def to_attrs(self) -> dict[str, Any]:

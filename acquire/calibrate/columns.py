@@ -26,7 +26,7 @@ from acquire.calibrate.curve import straightened
 from acquire.calibrate.exposure import moments, no_progress
 from acquire.errors import UsageError
 from acquire.lines import ARMS
-from acquire.noise import QUANTISATION_DN2
+from acquire.noise import QUANTISATION_DN2, robust_sigma
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -175,7 +175,7 @@ def dark_edges(shape: NDArray[np.float64], usable: NDArray[np.bool_]) -> NDArray
     for row, good, out in zip(shape, usable, dark, strict=True):
         # By medians, which the dark columns that are looked for hardly change.
         middle = np.median(row[good])
-        spread = 1.4826 * np.median(np.abs(row[good] - middle))
+        spread = robust_sigma(row[good] - middle)
         low = row < middle - np.maximum(DARK_EDGE * spread, 2e-3 * middle)
         for order in (slice(None, most), slice(None, -most - 1, -1)):
             # from the edge inwards, up to the first column that is bright
@@ -240,8 +240,7 @@ def edge_doubt(
 def _spread(shape: NDArray[np.float64], usable: NDArray[np.bool_]) -> float:
     """Return the standard deviation of the columns' own response, averaged over the arms."""
     inner = [row[good] for row, good in zip(shape, usable, strict=True)]
-    # By medians, which outliers hardly change; that of normal deviations is σ/1.4826.
-    return float(np.mean([1.4826 * np.median(np.abs(row / np.median(row) - 1)) for row in inner]))
+    return float(np.mean([robust_sigma(row / np.median(row) - 1) for row in inner]))
 
 
 def _profile(response: NDArray[np.float64], usable: NDArray[np.bool_]) -> NDArray[np.float64]:

@@ -29,6 +29,7 @@ from acquire.calibrate.calibration import Finding, Measured
 from acquire.calibrate.still import stills
 from acquire.errors import UsageError
 from acquire.lines import ARMS
+from acquire.noise import robust_sigma
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -152,8 +153,7 @@ def widths(edges: list[Edge], arm: str) -> tuple[NDArray[np.float64], NDArray[np
     if np.linalg.cond(gram) > 1e10:
         raise _undetermined(arm, "its edges all have the same direction")
     # Scatter of the windows beyond their own errors is due to the target, and adds to the uncertainty.
-    # 1.4826 times the median of the absolute values is σ of normal noise, and outliers hardly change it.
-    scatter = float(1.4826 * np.median(np.abs(residual(solved.x))))
+    scatter = robust_sigma(residual(solved.x))
     # The OVERLAP² windows that contain the same edge count as one, hence the factor of its root.
     doubt = np.hypot(OVERLAP * np.sqrt(np.diag(np.linalg.inv(gram))) * max(1.0, scatter), SHAPE)
     for axis, uncertainty, needed in zip(("along", "across"), doubt, ("across", "along"), strict=True):

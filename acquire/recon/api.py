@@ -14,6 +14,7 @@ from acquire.errors import UsageError
 from acquire.lines import Segment
 from acquire.recon.aliasing import detect_unresolved_light, name_gaps
 from acquire.recon.balance import balance_of, divided
+from acquire.recon.basis import cosine_hz
 from acquire.recon.clock import IterationClock
 from acquire.recon.cycle import describe_cycle
 from acquire.recon.denoisers import open_denoiser
@@ -208,11 +209,10 @@ class _Run:
         check = check and self.options.static_image is None and clock.ended != "stopped"
         checked = check_description(segment, quality, clock) if check else DescriptionCheck()
         facts = estimate.facts()
-        # K cosines over a span resolve K/(2·span)
-        cosine_hz = 1 / (2e-9 * segment.substep_ns * T_m * len(video))
+        one_hz = cosine_hz(segment.substep_ns * T_m, len(video))
         # solvers without a band are free in every frame
         whole = [(0, facts.get("temporal_coefficients", len(video)))]
-        bands_hz = [(a * cosine_hz, b * cosine_hz) for a, b in facts.pop("bands", whole)]
+        bands_hz = [(a * one_hz, b * one_hz) for a, b in facts.pop("bands", whole)]
         resolved_hz = bands_hz[-1][1]
         unresolved: tuple[str, ...] = ()
         if check and checked.believed:

@@ -37,6 +37,7 @@ if TYPE_CHECKING:
     from acquire.arrays import Array
     from acquire.blur import Blur
     from acquire.geometry import Geometry
+    from acquire.lines import Segment
     from acquire.recon.basis import Basis
 
 
@@ -61,6 +62,26 @@ def band_operator(
     if 2 * geometry.lines * side * basis.count * itemsize <= LARGEST_FACTORS_BYTES:
         return BandOperator(geometry, code, basis, spatial_merge, temporal_merge, alignment, blur)
     return InBasis(geometry, code, basis, spatial_merge, temporal_merge, alignment, blur)
+
+
+def segment_operator(
+    segment: Segment,
+    basis: Basis,
+    spatial_merge: int,
+    temporal_merge: int,
+    *,
+    code: NDArray[Any] | None = None,
+) -> BandOperator | InBasis:
+    """B of a segment, with its alignment and blur; ``code`` replaces the segment's own."""
+    return band_operator(
+        segment.geometry,
+        segment.code if code is None else code,
+        basis,
+        spatial_merge,
+        temporal_merge,
+        segment.alignment,
+        segment.blur,
+    )
 
 
 class BandOperator:

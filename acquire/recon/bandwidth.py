@@ -21,7 +21,7 @@ from scipy.ndimage import median_filter
 
 from acquire.arrays import host
 from acquire.recon.admm import Admm, AdmmParameters
-from acquire.recon.band import band_operator
+from acquire.recon.band import segment_operator
 from acquire.recon.basis import TemporalBasis
 from acquire.recon.lamps import last_lamp, search_seconds
 from acquire.recon.problem import build_problem
@@ -119,9 +119,7 @@ def light_beyond(
     if frames // 2 <= count + WINDOW:
         return None
     basis = TemporalBasis(frames, frames // 2)
-    operator = band_operator(
-        segment.geometry, segment.code, basis, merge, temporal_merge, segment.alignment, segment.blur
-    )
+    operator = segment_operator(segment, basis, merge, temporal_merge)
     residual = np.where(problem.weight > 0, problem.samples - predicted, 0).astype(np.float32)
     energy = np.square(operator.adjoint(residual), dtype=np.float64).sum((1, 2))
     floor = np.maximum(median_filter(energy, WINDOW, mode="nearest"), np.finfo(float).tiny)
@@ -145,11 +143,7 @@ def _tentative(
     basis = TemporalBasis(frames, count, arrays)
     # all samples: nothing is judged by prediction here
     problem = build_problem(segment, merge, temporal_merge, hold_out=0.0, arrays=arrays)
-    operator = problem.masked(
-        band_operator(
-            segment.geometry, segment.code, basis, merge, temporal_merge, segment.alignment, segment.blur
-        )
-    )
+    operator = problem.masked(segment_operator(segment, basis, merge, temporal_merge))
     parameters = AdmmParameters(grid_per_coefficient=1)
     solver = Admm(operator, problem.used_samples, (count, side, side), basis, parameters)
     for made in range(ITERATIONS):

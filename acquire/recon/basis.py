@@ -23,6 +23,11 @@ if TYPE_CHECKING:
     from acquire.arrays import Array, Arrays
 
 
+def cosine_hz(frame_ns: float, frames: int) -> float:
+    """Frequency of the first cosine over ``frames`` frames; K cosines over a span resolve K/(2·span)."""
+    return 1e9 / (2 * frame_ns * frames)
+
+
 class Basis(Protocol):
     """Orthonormal rows D (K, T) along the frames' time."""
 

@@ -17,7 +17,7 @@ import numpy as np
 
 from acquire.arrays import host
 from acquire.recon.admm import Admm
-from acquire.recon.band import band_operator
+from acquire.recon.band import segment_operator
 from acquire.recon.bandwidth import FEWEST_COEFFICIENTS
 from acquire.recon.basis import TemporalBasis
 from acquire.recon.joined import JoinedOperator, JoinedPrior, JoinedSign, Layout
@@ -85,11 +85,8 @@ class BesideMotion(Refinement):
     def _solver(self, operator: MaskedOperator, basis: LearnedBasis, emphasis: NDArray[Any]) -> Admm:
         arrays, start = self._problem.arrays, self._theta
         parts = self._layout.parts(start)
-        bases: tuple[Basis, Basis] = (self._slow, basis)
-        first, second = (
-            SignSplit(Admm.grid_of(own, self.parameters), part, None)
-            for own, part in zip(bases, parts, strict=True)
-        )
+        volume = SignSplit(Admm.grid_of(self._slow, self.parameters), parts[0], None)
+        patterns = SignSplit(Admm.grid_of(basis, self.parameters), parts[1], None)
         denoisers = VolumeTv(PACE), FrameTv(self.parameters.tv_iterations, joint=True)
         weights = VOLUME_WEIGHT, arrays.asarray(emphasis)
         return Admm(
@@ -100,7 +97,7 @@ class BesideMotion(Refinement):
             self.parameters,
             start=start,
             denoiser=JoinedPrior(self._layout, denoisers, weights),
-            sign=JoinedSign(self._layout, first, second),
+            sign=JoinedSign(self._layout, volume, patterns),
         )
 
     @property
@@ -119,8 +116,7 @@ class BesideMotion(Refinement):
 
     @cached_property
     def _volume_operator(self) -> Operator:
-        of, merges = self.segment, (self._spatial_merge, self._temporal_merge)
-        return band_operator(of.geometry, of.code, self._slow, *merges, of.alignment, of.blur)
+        return segment_operator(self.segment, self._slow, self._spatial_merge, self._temporal_merge)
 
     def _operators(self) -> tuple[MaskedOperator, LearnedBasis]:
         _, basis = super()._operators()

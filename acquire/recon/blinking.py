@@ -17,7 +17,7 @@ import numpy as np
 from acquire.arrays import host
 from acquire.recon.admm import Admm, AdmmParameters
 from acquire.recon.aliasing import unresolved_hz
-from acquire.recon.band import band_operator
+from acquire.recon.band import segment_operator
 from acquire.recon.bandwidth import (
     FEWEST_COEFFICIENTS,
     MARGIN,
@@ -26,7 +26,7 @@ from acquire.recon.bandwidth import (
     is_large,
     light_beyond,
 )
-from acquire.recon.basis import TemporalBasis, resized
+from acquire.recon.basis import TemporalBasis, cosine_hz, resized
 from acquire.recon.beside_motion import BesideMotion, find_lamps
 from acquire.recon.estimates import InBand, Refined
 from acquire.recon.patterns import PARAMETERS, ROUND, Refinement, find_patterns
@@ -180,11 +180,8 @@ def _followed(
 
     The ``first`` look and what was ``found`` in it are returned if the other predicts no better.
     """
-    rate_hz = 1e9 / (segment.substep_ns * options.temporal_merge)
-    faster = (
-        f"the lines contain light of about {cosine * rate_hz / (2 * first.basis.frames):.3g} Hz, faster "
-        "than the band of the video"
-    )
+    lamp_hz = cosine * cosine_hz(segment.substep_ns * options.temporal_merge, first.basis.frames)
+    faster = f"the lines contain light of about {lamp_hz:.3g} Hz, faster than the band of the video"
     if options.bandwidth is not None or clock.spent(WIDER_SHARE):
         clock.shortcuts.append(f"{faster}: a longer budget or a higher bandwidth shows it")
         return first, found
@@ -221,12 +218,12 @@ def _hidden_lamp(
         return None  # nothing would be solved again: `detect_unresolved_light` reports it at the end
     if not problem.prediction_error(predicted) > left:
         return None
-    cosine_hz = 1 / (2e-9 * segment.substep_ns * options.temporal_merge * first.basis.frames)
-    resolved_hz = first.basis.cosines * cosine_hz
+    frame_ns = segment.substep_ns * options.temporal_merge
+    resolved_hz = first.basis.cosines * cosine_hz(frame_ns, first.basis.frames)
     found_hz = unresolved_hz(segment, problem, predicted, found.video(), resolved_hz=resolved_hz, clock=clock)
     if found_hz is None:
         return None
-    cosine = round(found_hz / cosine_hz)
+    cosine = round(found_hz / cosine_hz(frame_ns, first.basis.frames))
     # frames may be too slow for it
     return cosine if cosine < first.basis.frames // 2 else None
 
@@ -287,7 +284,7 @@ def _begin(
     """A solver in the coefficients of a basis, from a start."""
     N_m, T_m = options.spatial_merge, options.temporal_merge
     frames, side, _ = segment.geometry.video_shape(N_m, T_m)
-    operator = band_operator(segment.geometry, segment.code, basis, N_m, T_m, segment.alignment, segment.blur)
+    operator = segment_operator(segment, basis, N_m, T_m)
     parameters = _defaults(frames, explained=explained)
     if options.tv_weight is not None:
         parameters = replace(parameters, tv_weight=options.tv_weight)
@@ -405,7 +402,7 @@ def find_band(segment: Segment, problem: Problem, options: SolveOptions, clock: 
         return min(frames, max(1, round(options.bandwidth * frames)))
     if clock.spent(UNSEARCHED_SHARE):
         few = min(frames, FEWEST_COEFFICIENTS)
-        limit_hz = few / (2e-9 * segment.substep_ns * T_m * frames)
+        limit_hz = few * cosine_hz(segment.substep_ns * T_m, frames)
         clock.shortcuts.append(
             "the budget left no time to search for the scene's bandwidth: the video holds only changes "
             f"slower than {limit_hz:.3g} Hz"

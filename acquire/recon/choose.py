@@ -84,32 +84,29 @@ class AdmmSolver(Solver):
     def solve(
         self, segment: Segment, problem: Problem, options: SolveOptions, clock: IterationClock
     ) -> Estimate:
-        return solve_admm(segment, problem, options, clock)
+        """Solve with the prior that predicts best.
 
-
-def solve_admm(segment: Segment, problem: Problem, options: SolveOptions, clock: IterationClock) -> Estimate:
-    """Solve with the prior that predicts best.
-
-    If the options give a bandwidth, weight, denoiser or start, the cosines are solved for without a choice.
-    """
-    held_out = HeldOut(problem, segment.geometry)
-    fixed = (options.denoiser, options.tv_weight, options.bandwidth, options.initial)
-    if not held_out or any(each is not None for each in fixed):
-        return solve_in_cosines(segment, problem, options, clock)
-    bench = Workbench(segment, problem, options, clock, held_out)
-    trials = max(4, options.iterations // ITERATIONS_PER_TRIAL)
-    if options.choice is not None:
-        reused = reuse_choice(bench, segment, options, trials)
-        if reused is not None:
-            return reused
-    if bench.frames == 1:
-        still = bench.attempt(STILL, FIRST_ITERATIONS)
-        return bench.finish(best_still(still, trials, merge=options.spatial_merge))
-    volume = bench.attempt(bench.fitting(VOLUME), FIRST_ITERATIONS)
-    if clock.spent(SEARCH_SHARE):
-        clock.shortcuts.append("the budget left no time to try more than one kind of motion")
-        return bench.finish(volume)
-    return _choose(bench, segment, options, volume, trials)
+        If the options give a bandwidth, weight, denoiser or start, the cosines are solved for without a
+        choice.
+        """
+        held_out = HeldOut(problem, segment.geometry)
+        fixed = (options.denoiser, options.tv_weight, options.bandwidth, options.initial)
+        if not held_out or any(each is not None for each in fixed):
+            return solve_in_cosines(segment, problem, options, clock)
+        bench = Workbench(segment, problem, options, clock, held_out)
+        trials = max(4, options.iterations // ITERATIONS_PER_TRIAL)
+        if options.choice is not None:
+            reused = reuse_choice(bench, segment, options, trials)
+            if reused is not None:
+                return reused
+        if bench.frames == 1:
+            still = bench.attempt(STILL, FIRST_ITERATIONS)
+            return bench.finish(best_still(still, trials, merge=options.spatial_merge))
+        volume = bench.attempt(bench.fitting(VOLUME), FIRST_ITERATIONS)
+        if clock.spent(SEARCH_SHARE):
+            clock.shortcuts.append("the budget left no time to try more than one kind of motion")
+            return bench.finish(volume)
+        return _choose(bench, segment, options, volume, trials)
 
 
 def _choose(

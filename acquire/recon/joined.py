@@ -27,70 +27,70 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class Layout:
-    """Where both parts are in one array of a single axis; ``scale`` multiplies the first part."""
+    """Where both parts are in one array of a single axis; ``scale`` multiplies the volume."""
 
-    first: Shape
-    second: Shape
+    volume: Shape
+    patterns: Shape
     scale: float
 
     @property
     def shape(self) -> Shape:
-        return (math.prod(self.first) + math.prod(self.second),)
+        return (math.prod(self.volume) + math.prod(self.patterns),)
 
-    def joined(self, first: Array, second: Array) -> Array:
-        xp = namespace(first)
-        return xp.concat([xp.reshape(self.scale * first, (-1,)), xp.reshape(second, (-1,))])
+    def joined(self, volume: Array, patterns: Array) -> Array:
+        xp = namespace(volume)
+        return xp.concat([xp.reshape(self.scale * volume, (-1,)), xp.reshape(patterns, (-1,))])
 
     def parts(self, theta: Array) -> tuple[Array, Array]:
-        xp, size = namespace(theta), math.prod(self.first)
-        first, second = xp.reshape(theta[:size], self.first), xp.reshape(theta[size:], self.second)
-        return first / self.scale, second
+        xp, size = namespace(theta), math.prod(self.volume)
+        volume, patterns = xp.reshape(theta[:size], self.volume), xp.reshape(theta[size:], self.patterns)
+        return volume / self.scale, patterns
 
 
 class JoinedOperator:
     """B₁·θ₁ + B₂·θ₂ and its transpose."""
 
-    def __init__(self, layout: Layout, first: Operator, second: Operator) -> None:
-        self._layout, self._first, self._second = layout, first, second
+    def __init__(self, layout: Layout, volume: Operator, patterns: Operator) -> None:
+        self._layout, self._volume, self._patterns = layout, volume, patterns
 
     def forward(self, theta: Array) -> Array:
-        first, second = self._layout.parts(theta)
-        return self._first.forward(first) + self._second.forward(second)
+        volume, patterns = self._layout.parts(theta)
+        return self._volume.forward(volume) + self._patterns.forward(patterns)
 
     def adjoint(self, lines: Array) -> Array:
         # θ₁ is stored s times too large
-        first = self._first.adjoint(lines) / self._layout.scale**2
-        return self._layout.joined(first, self._second.adjoint(lines))
+        volume = self._volume.adjoint(lines) / self._layout.scale**2
+        return self._layout.joined(volume, self._patterns.adjoint(lines))
 
 
 class JoinedSign:
     """Neither part is negative: a `SignSplit` of each."""
 
-    def __init__(self, layout: Layout, first: SignSplit, second: SignSplit) -> None:
-        self._layout, self._first, self._second = layout, first, second
+    def __init__(self, layout: Layout, volume: SignSplit, patterns: SignSplit) -> None:
+        self._layout, self._volume, self._patterns = layout, volume, patterns
 
     def advance(self, theta: Array) -> None:
-        for split, part in zip((self._first, self._second), self._layout.parts(theta), strict=True):
+        for split, part in zip((self._volume, self._patterns), self._layout.parts(theta), strict=True):
             split.advance(part)
 
     def pull(self) -> Array:
-        return self._layout.joined(self._first.pull(), self._second.pull())
+        return self._layout.joined(self._volume.pull(), self._patterns.pull())
 
     def rescale(self, factor: float) -> None:
-        self._first.rescale(factor)
-        self._second.rescale(factor)
+        self._volume.rescale(factor)
+        self._patterns.rescale(factor)
 
     def rebase(self, grid: Array, shape: Shape) -> None:  # noqa: ARG002 (the split's; both shapes are known)
-        """Continue on another grid of the second part, whose basis changes."""
-        self._second.rebase(grid, self._layout.second)
+        """Continue on another grid of the patterns, whose basis changes."""
+        self._patterns.rebase(grid, self._layout.patterns)
 
     def resume(self, other: JoinedSign) -> None:
-        self._first.resume(other._first)
-        self._second.resume(other._second)
+        self._volume.resume(other._volume)
+        self._patterns.resume(other._patterns)
 
     def copied(self) -> JoinedSign:
         other = copy(self)
-        other._first, other._second = self._first.copied(), self._second.copied()
+        other._volume, other._patterns = self._volume.copied(), self._patterns.copied()
         return other
 
 
@@ -104,5 +104,5 @@ class JoinedPrior:
 
     def prox(self, frames: Array, weight: float | Array) -> Array:
         each = zip(self._denoisers, self._layout.parts(frames), self._weights, strict=True)
-        first, second = (denoiser.prox(part, weight * own) for denoiser, part, own in each)
-        return self._layout.joined(first, second)
+        volume, patterns = (denoiser.prox(part, weight * own) for denoiser, part, own in each)
+        return self._layout.joined(volume, patterns)

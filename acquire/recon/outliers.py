@@ -17,6 +17,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from scipy.ndimage import median_filter
 
+from acquire.noise import robust_sigma
+
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
@@ -53,8 +55,7 @@ def _spikes(samples: NDArray[np.float64], left: NDArray[np.bool_]) -> NDArray[np
         return np.zeros_like(left)
     # along lines only: neighbouring lines share their light, neighbouring columns need not
     deviation = np.abs(samples - median_filter(samples, size=(1, SPIKE_LINES, 1), mode="nearest"))
-    # standard deviation of normal noise with this median
-    spread = 1.4826 * np.median(deviation[left])
+    spread = robust_sigma(deviation[left])
     level = np.quantile(np.abs(samples[left]), 0.99)
     far = SPIKE_DEVIATIONS * spread + SPIKE_LEVEL * level
     found = np.asarray(left & (deviation > far))

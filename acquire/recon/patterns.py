@@ -25,7 +25,7 @@ import numpy as np
 from acquire.arrays import host
 from acquire.forward import merge_video
 from acquire.recon.admm import Admm, AdmmParameters
-from acquire.recon.band import band_operator
+from acquire.recon.band import segment_operator
 from acquire.recon.basis import LearnedBasis
 from acquire.recon.curves import CurveFit
 
@@ -307,10 +307,7 @@ class Refinement:
     def _operators(self) -> tuple[MaskedOperator, LearnedBasis]:
         """The patterns' operator and the basis of their curves, for the present curves."""
         basis = LearnedBasis(self._cosines, self.found.curves)
-        geometry, code = self.segment.geometry, self.segment.code
-        self._operator: Operator = band_operator(
-            geometry, code, basis, 1, self._temporal_merge, self.segment.alignment, self.segment.blur
-        )
+        self._operator: Operator = segment_operator(self.segment, basis, 1, self._temporal_merge)
         return self._problem.masked(self._operator), basis
 
     def _fit_curves(self) -> None:

@@ -18,7 +18,7 @@ import numpy as np
 
 from acquire.arrays import host
 from acquire.recon.admm import Admm
-from acquire.recon.band import band_operator
+from acquire.recon.band import segment_operator
 from acquire.recon.bandwidth import FEWEST_COEFFICIENTS, MARGIN
 from acquire.recon.basis import LearnedBasis, TemporalBasis, resized
 from acquire.recon.patterns import find_patterns
@@ -201,15 +201,7 @@ def _spectrum(
     """The energy of what a prediction leaves of the samples, per cosine."""
     frames = segment.geometry.video_shape(1, temporal_merge)[0]
     merge = -(-segment.geometry.size // COARSE_SIDE)
-    operator = band_operator(
-        segment.geometry,
-        segment.code,
-        TemporalBasis(frames, count),
-        merge,
-        temporal_merge,
-        segment.alignment,
-        segment.blur,
-    )
+    operator = segment_operator(segment, TemporalBasis(frames, count), merge, temporal_merge)
 
     def energy(predicted: NDArray[np.float64]) -> NDArray[np.float64]:
         left = np.where(problem.weight > 0, problem.samples - predicted, 0).astype(np.float32)

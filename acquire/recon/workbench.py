@@ -16,7 +16,7 @@ import numpy as np
 from acquire.arrays import host
 from acquire.forward import merge_video
 from acquire.recon.admm import Admm
-from acquire.recon.band import band_operator
+from acquire.recon.band import segment_operator
 from acquire.recon.basis import CyclicBasis, TemporalBasis, resized
 from acquire.recon.brightness import fit_brightness
 from acquire.recon.candidates import CALM, CYCLE, USUAL_ENERGY, VOLUME, Candidate, parameters
@@ -284,7 +284,17 @@ class Workbench:
             admm.resume(start.admm)
             if isinstance(denoiser, VolumeTv) and isinstance(start.denoiser, VolumeTv):
                 denoiser.resume(start.denoiser)
-        trial = Trial(self, candidate, admm, denoiser, basis, operator, brightness, np.zeros(0), np.inf)
+        trial = Trial(
+            bench=self,
+            candidate=candidate,
+            admm=admm,
+            denoiser=denoiser,
+            basis=basis,
+            operator=operator,
+            brightness=brightness,
+            errors=np.zeros(0),
+            error=np.inf,
+        )
         began = self.clock.seconds
         for _ in self.clock.attempt(iterations, "choose", SEARCH_SHARE):
             admm.step()
@@ -397,7 +407,7 @@ class Workbench:
         code: NDArray[Any] = segment.code
         if brightness is not None:
             code = code * np.repeat(brightness, self._merges[1])[: len(code)]
-        return band_operator(segment.geometry, code, basis, *self._merges, segment.alignment, segment.blur)
+        return segment_operator(segment, basis, *self._merges, code=code)
 
 
 class Chosen:

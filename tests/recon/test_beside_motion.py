@@ -30,7 +30,7 @@ RNG = np.random.default_rng(0)
 
 
 def parts() -> tuple[np.ndarray, np.ndarray]:
-    return RNG.standard_normal(LAYOUT.first), RNG.standard_normal(LAYOUT.second)
+    return RNG.standard_normal(LAYOUT.volume), RNG.standard_normal(LAYOUT.patterns)
 
 
 def test_what_is_joined_comes_apart_again() -> None:
