@@ -59,9 +59,16 @@ class AsyncClient:
         request_id: str | None = None,
     ) -> Status:
         """Go from idle to armed; the light follows ``code``."""
-        trigger = {"delays": delays, "window": window}
-        how = {"force": force, "code": code, "calibration": calibration, **trigger}
-        return await self.call(core.arm(request_id=request_id, **how))
+        return await self.call(
+            core.arm(
+                request_id,
+                force=force,
+                code=code,
+                calibration=calibration,
+                delays=delays,
+                window=window,
+            )
+        )
 
     async def start(
         self,
@@ -75,14 +82,17 @@ class AsyncClient:
         request_id: str | None = None,
     ) -> Status:
         """Go from armed to recording."""
-        budget = {
-            "lines": lines,
-            "duration_s": duration_s,
-            "pre_s": pre_s,
-            "post_s": post_s,
-            "resume": resume,
-        }
-        return await self.call(core.start(path, request_id, **budget))
+        return await self.call(
+            core.start(
+                path,
+                request_id,
+                lines=lines,
+                duration_s=duration_s,
+                pre_s=pre_s,
+                post_s=post_s,
+                resume=resume,
+            )
+        )
 
     async def mark(self, text: str = "", *, request_id: str | None = None) -> Status:
         """Mark the newest line with an event."""

@@ -93,9 +93,16 @@ class Client:
         recordings get no copy of the rig's calibration. ``delays`` of light and cameras and the ``window`` of
         the light in each lit sub-step replace those of the rig.
         """
-        trigger = {"delays": delays, "window": window}
-        how = {"force": force, "code": code, "calibration": calibration, **trigger}
-        return self._do(core.arm(request_id=request_id, **how))
+        return self._do(
+            core.arm(
+                request_id,
+                force=force,
+                code=code,
+                calibration=calibration,
+                delays=delays,
+                window=window,
+            )
+        )
 
     def start(
         self,
@@ -114,14 +121,17 @@ class Client:
         ``post_s`` is the time from the request to its end. With ``resume``, ``path`` is a sealed recording
         that continues in a segment next to it.
         """
-        budget = {
-            "lines": lines,
-            "duration_s": duration_s,
-            "pre_s": pre_s,
-            "post_s": post_s,
-            "resume": resume,
-        }
-        return self._do(core.start(path, request_id, **budget))
+        return self._do(
+            core.start(
+                path,
+                request_id,
+                lines=lines,
+                duration_s=duration_s,
+                pre_s=pre_s,
+                post_s=post_s,
+                resume=resume,
+            )
+        )
 
     def mark(self, text: str = "", *, request_id: str | None = None) -> Status:
         """Mark the newest line with an event, which starts a recording if the rig's ``[events]`` allow it."""

@@ -189,7 +189,7 @@ def command(
     return Call("POST", name, answer, body, request_id=request_id or secrets.token_hex(16))
 
 
-def arm(*, request_id: str | None, **how: Any) -> Call[Status]:
+def arm(request_id: str | None, **how: Any) -> Call[Status]:
     return command("arm", Status, request("arm", ArmRequest, **how), request_id)
 
 

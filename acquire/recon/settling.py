@@ -60,15 +60,15 @@ must predict better: first they have to take up the light of the others."""
 def settle(refinement: Refinement, problem: Problem, clock: IterationClock) -> Refinement:
     """Refine until the held-out samples are predicted no better, or the clock ends it: the best state."""
     course = _Course(refinement, problem)
-    course.settles(clock, LOOSENED_IN_VAIN, EARLY_ROUNDS * ROUND)
-    course.go_on_with(_without_superfluous(course.refinement, problem, clock))
-    if course.settles(clock, LOOSENED_IN_VAIN, TRIAL_AFTER * ROUND):
+    course.refine_until_idle(clock, LOOSENED_IN_VAIN, EARLY_ROUNDS * ROUND)
+    course.continue_with(_without_superfluous(course.refinement, problem, clock))
+    if course.refine_until_idle(clock, LOOSENED_IN_VAIN, TRIAL_AFTER * ROUND):
         course.hold(course.likely_weight)
-    course.go_on_with(_without_doubtful(course.refinement, problem, clock))
+    course.continue_with(_without_doubtful(course.refinement, problem, clock))
     # not held yet if no noise was fitted within `TRIAL_AFTER` rounds
-    if course.refinement.loosens and course.settles(clock, LOOSENED_IN_VAIN):
+    if course.refinement.loosens and course.refine_until_idle(clock, LOOSENED_IN_VAIN):
         course.hold(course.likely_weight)
-    while course.settles(clock, PATIENCE):
+    while course.refine_until_idle(clock, PATIENCE):
         if course.recent >= (1 - LEAST_GAIN) * course.before:
             clock.converged()
             break
@@ -94,7 +94,7 @@ class _Course:
         # an RMS of N values has a relative standard error of 1/√(2N)
         self._doubt = SURE / np.sqrt(2 * max(1, problem.held_out.sum()))
 
-    def settles(self, clock: IterationClock, patience: int, most: int | None = None) -> bool:
+    def refine_until_idle(self, clock: IterationClock, patience: int, most: int | None = None) -> bool:
         """Refine until this many rounds in turn gain nothing; False if it ends before, after ``most``."""
         steps = clock.run(most or clock.iterations, "refine", video=self.refinement.video, first=FIRST_ROUND)
         for _ in steps:
@@ -130,7 +130,7 @@ class _Course:
         self.refinement.hold(weight)
         self.before, self.recent, self._idle = self.recent, np.inf, 0
 
-    def go_on_with(self, refinement: Refinement) -> None:
+    def continue_with(self, refinement: Refinement) -> None:
         """Continue with another refinement; the best state so far remains the result unless it is beaten."""
         if refinement is not self.refinement:
             self.refinement, self.recent, self._idle = refinement, np.inf, 0

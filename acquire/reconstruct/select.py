@@ -224,9 +224,9 @@ def along_plan(selection: Selection, plan: ReconstructionPlan, grid: Voxels | No
         tuple(stretches),
         Grid.finest(stretches, geometry.size, grid),
         _trusted(stream, begin, edge),
-        plan.fade_substeps,
-        tuple(part.name for part in plan.segments),
-        tuple(part.why for part in plan.segments),
+        fade=plan.fade_substeps,
+        names=tuple(part.name for part in plan.segments),
+        reasons=tuple(part.why for part in plan.segments),
     )
 
 

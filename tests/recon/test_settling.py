@@ -51,7 +51,7 @@ def course(*rounds: tuple[float, float, float], noise: float = NOISE) -> _Course
     clock: Any = SimpleNamespace(
         iterations=len(rounds), run=lambda most, *stage, **of_stage: range(min(most, len(rounds)))
     )
-    made.ended = made.settles(clock, LOOSENED_IN_VAIN)
+    made.ended = made.refine_until_idle(clock, LOOSENED_IN_VAIN)
     return made  # type: ignore[no-any-return]
 
 
