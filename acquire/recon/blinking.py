@@ -15,19 +15,24 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from acquire.arrays import host
-from acquire.recon.admm import Admm, AdmmParameters
+from acquire.recon.admm import AdmmParameters
 from acquire.recon.aliasing import unresolved_hz
-from acquire.recon.band import segment_operator
 from acquire.recon.bandwidth import (
-    FEWEST_COEFFICIENTS,
     MARGIN,
-    estimate_coefficients,
     fastest_lamp,
     is_large,
     light_beyond,
 )
 from acquire.recon.basis import TemporalBasis, cosine_hz, resized
 from acquire.recon.beside_motion import BesideMotion, find_lamps
+from acquire.recon.cosines import (
+    FEW_FRAMES,
+    LAMPS_SHARE,
+    TENTATIVE_SHARE,
+    UNSEARCHED_SHARE,
+    begin_in_cosines,
+    find_band,
+)
 from acquire.recon.estimates import InBand, Refined
 from acquire.recon.patterns import PARAMETERS, ROUND, Refinement, find_patterns
 from acquire.recon.pursuit import pursue, widened
@@ -38,7 +43,6 @@ if TYPE_CHECKING:
 
     from acquire.arrays import Array
     from acquire.lines import Segment
-    from acquire.recon.basis import Basis
     from acquire.recon.clock import IterationClock
     from acquire.recon.estimates import Estimate
     from acquire.recon.options import SolveOptions
@@ -61,24 +65,10 @@ EXPLAINED_BY_NOISE, LEAST_MISSED = 1.25, 0.01
 if the noise is unknown; the search for it takes a tenth of the time."""
 SOON_EXPLAINED = 1.5
 """Held-out error of patterns after their first rounds, relative to the noise, up to which nothing moves."""
-TENTATIVE_SHARE = 0.15
-"""Share of the budget after which the search for the bandwidth hurries."""
-LAMPS_SHARE = 0.3
-"""Share of the budget within which the search for the fastest lamp must end; otherwise it is skipped."""
-# 0.2 was a cliff on a busy host, where posing alone may take as much
-UNSEARCHED_SHARE = 0.4
-"""Share of the budget that posing the problem may take; beyond it, the bandwidth is not searched for."""
 PLAIN_ITERATIONS = 90
 """Number of iterations for scenes without patterns: more of them fit what voxels cannot represent."""
-USUAL_FRAMES = 980
-FEW_FRAMES = 32
-HELD_BACK = 100.0
-"""Factor of the penalties for few frames unless they explain the lines."""
 EXPLAINED = 0.1
 """Relative prediction error below which they do, and below which cosines start from a still."""
-STILL = AdmmParameters(tv_weight=5e-6, tv_penalty=1e-5, sign_penalty=3e-6, gradient_steps=6)
-"""Parameters for a single frame. All sub-steps add up in it, so that the mean light has an eigenvalue some
-thousand times that of a detail: lower penalties admit details, and more gradient steps reach them."""
 FREER = 0.85
 """Largest error of cosines that are no patterns, relative to that of a still, a volume or fewer cosines, for
 which they are preferred: they admit the most noise. With equal errors a volume is 2 to 8 dB better."""
@@ -105,7 +95,7 @@ def first_look(
 ) -> InBand:
     """A first look in the requested or estimated band, from the coefficients (1, n′, n′) of a still."""
     count = find_band(segment, problem, options, clock)
-    first = _glance(segment, problem, options, clock, count=count, still=still)
+    first = _solve_glance(segment, problem, options, clock, count=count, still=still)
     complete_look(first, options, clock)
     return first
 
@@ -123,7 +113,7 @@ def glance(
         return lamps
     clock.reset()  # the limit holds for each stage
     count = find_band(segment, problem, options, clock)
-    return _glance(segment, problem, options, clock, count=count, still=still)
+    return _solve_glance(segment, problem, options, clock, count=count, still=still)
 
 
 def _look_for_lamps(
@@ -144,7 +134,7 @@ def _look_for_lamps(
         hurry, affords = partial(clock.spent, TENTATIVE_SHARE), partial(clock.affords, share=LAMPS_SHARE)
         return fastest_lamp(segment, problem, options.temporal_merge, hurry, affords)
 
-    begin = partial(_begin, segment, problem, options)
+    begin = partial(begin_in_cosines, segment, problem, options)
     return pursue(segment, problem, merges, begin, iterations, search, still)
 
 
@@ -152,7 +142,7 @@ def refine(
     segment: Segment, problem: Problem, options: SolveOptions, clock: IterationClock, first: InBand
 ) -> Estimate:
     """Refine a first look, and solve again in a wider band if the lines show light beyond this one."""
-    found = _refine(segment, problem, options, clock, first)
+    found = _refine_once(segment, problem, options, clock, first)
     if not clock.affords(BEYOND_S * segment.geometry.lines * first.basis.frames):
         return found
     seen = light_beyond(segment, problem, found.predict(), options.temporal_merge, first.basis.cosines)
@@ -187,13 +177,13 @@ def _followed(
         return first, found
     clock.reset()
     if alone:
-        look = widened(first, cosine, partial(_begin, segment, problem, options))
+        look = widened(first, cosine, partial(begin_in_cosines, segment, problem, options))
     else:
         # the constant cosine is a still, of which the wider band is to find the change
         still, count = first.solver.theta[:1, ...], round(MARGIN * (cosine + 1))
-        look = _glance(segment, problem, options, clock, count=count, still=still)
+        look = _solve_glance(segment, problem, options, clock, count=count, still=still)
     complete_look(look, options, clock)
-    wider = _refine(segment, problem, options, clock, look)
+    wider = _refine_once(segment, problem, options, clock, look)
     before, after = (problem.prediction_error(each.predict()) for each in (found, wider))
     # the noise that many cosines admit hardly shows in the lines, and patterns admit little of it
     if after < (1 if isinstance(wider, Refined) else FREER) * before:
@@ -228,7 +218,7 @@ def _hidden_lamp(
     return cosine if cosine < first.basis.frames // 2 else None
 
 
-def _refine(
+def _refine_once(
     segment: Segment, problem: Problem, options: SolveOptions, clock: IterationClock, first: InBand
 ) -> Estimate:
     """Patterns and curves, or more iterations in the cosines if the scene does not consist of a few."""
@@ -240,7 +230,7 @@ def _refine(
     return first
 
 
-def _glance(
+def _solve_glance(
     segment: Segment,
     problem: Problem,
     options: SolveOptions,
@@ -257,7 +247,7 @@ def _glance(
     """
     frames = segment.geometry.video_shape(options.spatial_merge, options.temporal_merge)[0]
     basis = TemporalBasis(frames, min(frames, count), problem.arrays)
-    begin = partial(_begin, segment, problem, options, basis)
+    begin = partial(begin_in_cosines, segment, problem, options, basis)
     start = None if still is None else resized(still, basis)
     if options.initial is not None:
         # in the solvers' units, as `_Run.in_scene_units` undoes at the end
@@ -270,34 +260,6 @@ def _glance(
         # freed of the high penalties, few frames at rest reached 36 dB instead of 21
         estimate = begin(estimate.solver.theta, explained=True)
     return estimate
-
-
-def _begin(
-    segment: Segment,
-    problem: Problem,
-    options: SolveOptions,
-    basis: Basis,
-    start: Array | None,
-    *,
-    explained: bool = False,
-) -> InBand:
-    """A solver in the coefficients of a basis, from a start."""
-    N_m, T_m = options.spatial_merge, options.temporal_merge
-    frames, side, _ = segment.geometry.video_shape(N_m, T_m)
-    operator = segment_operator(segment, basis, N_m, T_m)
-    parameters = _defaults(frames, explained=explained)
-    if options.tv_weight is not None:
-        parameters = replace(parameters, tv_weight=options.tv_weight)
-    solver = Admm(
-        problem.masked(operator),
-        problem.used_samples,
-        (basis.count, side, side),
-        basis,
-        parameters,
-        start=start,
-        denoiser=options.denoiser,
-    )
-    return InBand(solver, operator, basis, problem, parameters)
 
 
 def complete_look(first: InBand, options: SolveOptions, clock: IterationClock) -> None:
@@ -392,47 +354,3 @@ def _for_noise(segment: Segment, problem: Problem, first: InBand) -> AdmmParamet
         noise = NOISE_SHARE * problem.prediction_error(first.predict())
     # the constant first: `max` returns it if the other is NaN
     return replace(PARAMETERS, tv_weight=max(PARAMETERS.tv_weight, WEIGHT_PER_NOISE * noise))
-
-
-def find_band(segment: Segment, problem: Problem, options: SolveOptions, clock: IterationClock) -> int:
-    """Number of cosines: as requested, or as the lines show, or a few if the budget leaves no time."""
-    N_m, T_m = options.spatial_merge, options.temporal_merge
-    frames = segment.geometry.video_shape(N_m, T_m)[0]
-    if options.bandwidth is not None:
-        return min(frames, max(1, round(options.bandwidth * frames)))
-    if clock.spent(UNSEARCHED_SHARE):
-        few = min(frames, FEWEST_COEFFICIENTS)
-        limit_hz = few * cosine_hz(segment.substep_ns * T_m, frames)
-        clock.shortcuts.append(
-            "the budget left no time to search for the scene's bandwidth: the video holds only changes "
-            f"slower than {limit_hz:.3g} Hz"
-        )
-        return few
-    return estimate_coefficients(
-        segment,
-        problem,
-        (N_m, T_m),
-        partial(clock.spent, TENTATIVE_SHARE),
-        partial(clock.affords, share=LAMPS_SHARE),
-    )
-
-
-def _defaults(frames: int, *, explained: bool = False) -> AdmmParameters:
-    """Parameters for a video of this many frames.
-
-    Coefficients scale with the square root of the number of frames, and so does the suitable threshold λ/ρ. A
-    handful of frames of a moving scene cannot explain its lines: higher penalties fit less of the motion. If
-    they do (``explained``), the scene is at rest and is solved as a still is.
-    """
-    if frames == 1:
-        return STILL
-    usual = AdmmParameters()
-    threshold = usual.tv_weight / usual.tv_penalty * min(1.0, frames / USUAL_FRAMES) ** 0.5
-    penalty = usual.tv_penalty * (HELD_BACK if frames <= FEW_FRAMES and not explained else 1.0)
-    return replace(
-        usual,
-        tv_weight=threshold * penalty,
-        tv_penalty=penalty,
-        sign_penalty=usual.sign_penalty * penalty / usual.tv_penalty,
-        gradient_steps=STILL.gradient_steps if explained else usual.gradient_steps,
-    )

@@ -16,7 +16,7 @@ from acquire.arrays import host
 from acquire.forward import merge_video
 from acquire.recon.band import InBasis, band_operator
 from acquire.recon.basis import TemporalBasis
-from acquire.recon.blinking import find_band
+from acquire.recon.cosines import find_band
 from acquire.recon.curves import CurveFit, CurveOperator
 from acquire.recon.estimates import InBand
 from acquire.recon.solver import Solver

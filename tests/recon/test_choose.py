@@ -18,7 +18,7 @@ from acquire.evaluate.metrics import psnr
 from acquire.forward import DualArm, merge_video
 from acquire.geometry import Geometry
 from acquire.lines import Segment
-from acquire.recon import Progress, api, blinking, clock, reconstruct
+from acquire.recon import Progress, api, blinking, clock, cosines, reconstruct
 from acquire.recon.admm import Admm
 from acquire.recon.band import BandOperator
 from acquire.recon.bandwidth import light_beyond
@@ -163,7 +163,7 @@ def test_a_wide_band_does_not_take_the_time_of_the_search(monkeypatch: pytest.Mo
     for module in (clock, api):
         monkeypatch.setattr(module, "time", wall)
     monkeypatch.setattr(Admm, "step", step)
-    monkeypatch.setattr(blinking, "estimate_coefficients", lambda *_, **__: frames // 4)
+    monkeypatch.setattr(cosines, "estimate_coefficients", lambda *_, **__: frames // 4)
     result = reconstruct(recorded.segment, 3, 1, budget_s=10, refuse=False, check=False, error=False)
     tried = [each["prior"] for each in result.parameters["candidates"]]
     assert result.parameters["prior"] == "volume"

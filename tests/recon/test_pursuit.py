@@ -10,7 +10,7 @@ import pytest
 
 from acquire.arrays import host
 from acquire.lines import Segment
-from acquire.recon import blinking, reconstruct
+from acquire.recon import cosines, reconstruct
 from acquire.recon.bandwidth import FEWEST_COEFFICIENTS, MARGIN
 from acquire.recon.basis import LearnedBasis, TemporalBasis
 from acquire.recon.options import SolveOptions
@@ -38,7 +38,7 @@ def without_limit(_: InBand, most: int) -> Iterator[int]:
 
 def look_at(scene: str, seed: int, last_lamp: int = 0) -> InBand | None:
     segment, problem = posed(scene, seed)
-    begin = partial(blinking._begin, segment, problem, OPTIONS)
+    begin = partial(cosines.begin_in_cosines, segment, problem, OPTIONS)
     return pursue(segment, problem, (3, 1), begin, without_limit, lambda: last_lamp)
 
 
@@ -81,12 +81,12 @@ def test_another_cosine_leaves_the_picture_as_it_is() -> None:
     segment, problem = posed("leds", 61)
     look = look_at("leds", 61)
     assert look is not None
-    begin = partial(blinking._begin, segment, problem, OPTIONS)
+    begin = partial(cosines.begin_in_cosines, segment, problem, OPTIONS)
     wider = widened(look, 200, begin)
     assert {*kept(look), 198, 199, 200, 201, 202} == {*kept(wider)}
     assert wider.basis.cosines >= 203
     np.testing.assert_allclose(wider.video(), look.video(), atol=1e-5 * look.video().max())
-    whole = blinking._begin(segment, problem, OPTIONS, TemporalBasis(look.basis.frames, 40), None)
+    whole = cosines.begin_in_cosines(segment, problem, OPTIONS, TemporalBasis(look.basis.frames, 40), None)
     whole.solver.step()
     beyond = widened(whole, 100, begin)
     assert kept(beyond) == [*range(40), *range(98, 103)]
@@ -95,7 +95,7 @@ def test_another_cosine_leaves_the_picture_as_it_is() -> None:
 
 def test_a_look_that_may_not_iterate_ends() -> None:
     segment, problem = posed("leds", 61)
-    begin = partial(blinking._begin, segment, problem, OPTIONS)
+    begin = partial(cosines.begin_in_cosines, segment, problem, OPTIONS)
     assert pursue(segment, problem, (3, 1), begin, lambda *_: iter(()), lambda: 0) is None
 
 
