@@ -50,6 +50,8 @@ def bench(
     seconds: Annotated[
         float,
         typer.Option(
+            "--duration",
+            "--seconds",
             parser=seconds_between(0.1, 600),
             metavar="TIME",
             help="Duration of each run. Default: 2s.",

@@ -49,6 +49,8 @@ def live(
     seconds: Annotated[
         float | None,
         typer.Option(
+            "--duration",
+            "--seconds",
             parser=seconds_between(0.1, 86400),
             metavar="TIME",
             help="End after this time. Default: at Ctrl-C.",

@@ -201,7 +201,11 @@ def monitor(
     seconds: Annotated[
         float | None,
         typer.Option(
-            parser=seconds_between(0), metavar="TIME", help="End after this time. Default: no limit."
+            "--duration",
+            "--seconds",
+            parser=seconds_between(0),
+            metavar="TIME",
+            help="End after this time. Default: no limit.",
         ),
     ] = None,
     json: JsonFlag = False,
@@ -209,7 +213,7 @@ def monitor(
     """Print the trigger's tags as they arrive, until the run ends or Ctrl-C. With --json, one object per
     line.
 
-    Example: [bold]acquire trigger monitor --url /dev/ttyUSB0 --seconds 5[/]
+    Example: [bold]acquire trigger monitor --url /dev/ttyUSB0 --duration 5[/]
     """
     from itertools import islice
 

@@ -27,7 +27,11 @@ _LOOK_S = 0.2
 SecondsOption = Annotated[
     float | None,
     typer.Option(
-        parser=seconds_between(0.1, 86400), metavar="TIME", help="End after this time. Default: at Ctrl-C."
+        "--duration",
+        "--seconds",
+        parser=seconds_between(0.1, 86400),
+        metavar="TIME",
+        help="End after this time. Default: at Ctrl-C.",
     ),
 ]
 
@@ -43,7 +47,7 @@ def blink(
     """Blink the light slowly enough to see, while the cameras receive their line triggers.
 
     No camera is needed. The test shows that the trigger controls the light and which level turns it on: it is
-    dark before, between and after the flashes. It runs until Ctrl-C, or for --seconds; then the light is off.
+    dark before, between and after the flashes. It runs until Ctrl-C or for --duration; then the light is off.
 
     Example: [bold]acquire trigger blink --url /dev/ttyUSB0[/]
     """
@@ -75,7 +79,7 @@ def square(
 
     By default the light is on for one line and off for the next. Its edges then coincide with the line
     starts, so that an oscilloscope on the line trigger and a photodiode shows the delay of the light.
-    --substeps 1 is the fastest light of this rig. The test runs until Ctrl-C, or for --seconds; then the
+    --substeps 1 is the fastest light of this rig. The test runs until Ctrl-C, or for --duration; then the
     light is off.
 
     Example: [bold]acquire trigger square --url /dev/ttyUSB0 --substeps 1[/]
