@@ -1,6 +1,6 @@
 """Estimate of the scene's bandwidth from the lines alone: from coarse voxels, and from the fastest lamp.
 
-A few iterations on about 24 × 24 voxels with a quarter of all cosines take a second. What the coarse voxels
+A few iterations on about 24 × 24 voxels with a quarter of the sub-steps' cosines take a second. What the coarse voxels
 cannot represent spreads evenly over all coefficients, so that their upper half shows the height of that
 floor; the bandwidth ends with the last coefficient that rises above it, plus a margin. A scene whose light
 reaches into the upper half shows by peaks there; then the whole quarter is used.
@@ -22,7 +22,7 @@ from scipy.ndimage import median_filter
 from acquire.arrays import host
 from acquire.recon.admm import Admm, AdmmParameters
 from acquire.recon.band import segment_operator
-from acquire.recon.basis import TemporalBasis
+from acquire.recon.basis import TemporalBasis, reachable
 from acquire.recon.lamps import last_lamp, search_seconds
 from acquire.recon.problem import build_problem
 
@@ -48,7 +48,8 @@ FEWEST_COEFFICIENTS = 32
 WINDOW, STANDS_OUT = 61, 9.0
 """Number of neighbouring cosines whose median is the floor, and the ratio to it above which light is
 detected; residuals without light reach 5 to 8."""
-LARGEST_SHARE = 0.25
+LARGEST_SHARE, FASTEST_SHARE = 0.25, 0.5
+"""Share of the sub-steps' cosines that a band may have, and in which single lamps are looked for."""
 
 
 def estimate_coefficients(
@@ -60,12 +61,12 @@ def estimate_coefficients(
 ) -> int:
     """Estimate the number of cosines that the scene needs; with fewer iterations once ``hurry()``.
 
-    It is at least 32 (or the number of frames), at most a quarter of the frames (or 32). ``problem`` is that
-    of the segment; lamps are searched for on large sensors if ``affords`` accepts the processor time.
+    It is at least 32 (or the number of frames), at most a quarter of the sub-steps (or 32). ``problem`` is
+    that of the segment; lamps are searched for on large sensors if ``affords`` accepts the processor time.
     """
     spatial_merge, temporal_merge = merges
     frames = segment.geometry.video_shape(spatial_merge, temporal_merge)[0]
-    most = int(LARGEST_SHARE * frames)
+    most = reachable(frames, temporal_merge, LARGEST_SHARE)
     # the answer would be the same whatever the lines show
     if most <= FEWEST_COEFFICIENTS:
         return min(frames, FEWEST_COEFFICIENTS)
@@ -99,9 +100,10 @@ def fastest_lamp(
     affords: Callable[[float], bool],
 ) -> int:
     """Number of cosines up to the fastest lamp of the lines' covariance; 0 if there is none, or no time."""
-    if not affords(search_seconds(segment.geometry, temporal_merge, LARGEST_SHARE)):
+    share = min(1.0, LARGEST_SHARE * temporal_merge)
+    if not affords(search_seconds(segment.geometry, temporal_merge, share)):
         return 0
-    return last_lamp(segment, problem, temporal_merge, LARGEST_SHARE, hurry)
+    return last_lamp(segment, problem, temporal_merge, share, hurry)
 
 
 def light_beyond(
@@ -116,9 +118,10 @@ def light_beyond(
     merge = -(-segment.geometry.size // COARSE_SIDE)
     frames = segment.geometry.video_shape(merge, temporal_merge)[0]
     # too few cosines beyond the band to have a floor of their own
-    if frames // 2 <= count + WINDOW:
+    looked_at = reachable(frames, temporal_merge, FASTEST_SHARE)
+    if looked_at <= count + WINDOW:
         return None
-    basis = TemporalBasis(frames, frames // 2)
+    basis = TemporalBasis(frames, looked_at)
     operator = segment_operator(segment, basis, merge, temporal_merge)
     residual = np.where(problem.weight > 0, problem.samples - predicted, 0).astype(np.float32)
     energy = np.square(operator.adjoint(residual), dtype=np.float64).sum((1, 2))

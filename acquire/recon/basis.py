@@ -28,6 +28,15 @@ def cosine_hz(frame_ns: float, frames: int) -> float:
     return 1e9 / (2 * frame_ns * frames)
 
 
+def reachable(frames: int, temporal_merge: int, share: float) -> int:
+    """Return how many cosines there are up to ``share`` of those of single sub-steps, or all of the frames'.
+
+    Frames of T_m sub-steps are slower, but what they can show is not: their cosines are the first 1/T_m of
+    the sub-steps'.
+    """
+    return min(frames, int(share * temporal_merge * frames))
+
+
 class Basis(Protocol):
     """Orthonormal rows D (K, T) along the frames' time."""
 

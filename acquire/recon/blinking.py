@@ -18,12 +18,13 @@ from acquire.arrays import host
 from acquire.recon.admm import AdmmParameters
 from acquire.recon.aliasing import unresolved_hz
 from acquire.recon.bandwidth import (
+    FASTEST_SHARE,
     MARGIN,
     fastest_lamp,
     is_large,
     light_beyond,
 )
-from acquire.recon.basis import TemporalBasis, cosine_hz, resized
+from acquire.recon.basis import TemporalBasis, cosine_hz, reachable, resized
 from acquire.recon.beside_motion import BesideMotion, find_lamps
 from acquire.recon.cosines import (
     FEW_FRAMES,
@@ -215,7 +216,8 @@ def _hidden_lamp(
         return None
     cosine = round(found_hz / cosine_hz(frame_ns, first.basis.frames))
     # frames may be too slow for it
-    return cosine if cosine < first.basis.frames // 2 else None
+    most = reachable(first.basis.frames, options.temporal_merge, FASTEST_SHARE)
+    return cosine if cosine < most else None
 
 
 def _refine_once(

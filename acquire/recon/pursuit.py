@@ -19,8 +19,8 @@ import numpy as np
 from acquire.arrays import host
 from acquire.recon.admm import Admm
 from acquire.recon.band import segment_operator
-from acquire.recon.bandwidth import FEWEST_COEFFICIENTS, MARGIN
-from acquire.recon.basis import LearnedBasis, TemporalBasis, resized
+from acquire.recon.bandwidth import FASTEST_SHARE, FEWEST_COEFFICIENTS, MARGIN
+from acquire.recon.basis import LearnedBasis, TemporalBasis, reachable, resized
 from acquire.recon.patterns import find_patterns
 
 if TYPE_CHECKING:
@@ -71,7 +71,7 @@ def pursue(
     (1, n′, n′) of a ``still``.
     """
     frames = segment.geometry.video_shape(*merges)[0]
-    fastest = frames // 2
+    fastest = reachable(frames, merges[1], FASTEST_SHARE)
     # as for the search of a band: few cosines have no median that lamps could stand out of
     if fastest < 2 * FEWEST_COEFFICIENTS:
         return None

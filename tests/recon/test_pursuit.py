@@ -9,10 +9,11 @@ import numpy as np
 import pytest
 
 from acquire.arrays import host
+from acquire.evaluate.metrics import psnr
 from acquire.lines import Segment
 from acquire.recon import cosines, reconstruct
 from acquire.recon.bandwidth import FEWEST_COEFFICIENTS, MARGIN
-from acquire.recon.basis import LearnedBasis, TemporalBasis
+from acquire.recon.basis import LearnedBasis, TemporalBasis, reachable
 from acquire.recon.options import SolveOptions
 from acquire.recon.problem import Problem, build_problem
 from acquire.recon.pursuit import pursue, widened
@@ -114,3 +115,22 @@ def test_lamps_are_shown_better_and_sooner_than_in_the_whole_band() -> None:
     last = end_of_lamps(segment)
     assert lamps.parameters["patterns"] <= 5
     assert last < lamps.parameters["temporal_coefficients"] < 1.4 * last
+
+
+@pytest.mark.parametrize(
+    ("frames", "temporal_merge", "share", "reach"),
+    [(981, 1, 0.25, 245), (981, 1, 0.5, 490), (245, 4, 0.25, 245), (123, 8, 0.25, 123), (123, 8, 0.5, 123)],
+)
+def test_slow_frames_reach_as_far_as_they_can_show(
+    frames: int, temporal_merge: int, share: float, reach: int
+) -> None:
+    assert reachable(frames, temporal_merge, share) == reach
+
+
+def test_lamps_are_followed_in_frames_of_many_substeps() -> None:
+    """Frames of eight sub-steps (12.5 kHz) had a band of 1.6 kHz, and lamps of 2.5 and 5 kHz were lost."""
+    recorded = record("leds", 1, stages=24)
+    result = reconstruct(recorded.segment, 3, 8)
+    assert result.parameters["prior"] == "cosines"
+    assert result.parameters["resolved_bands_hz"][-1][1] > 5e3
+    assert psnr(result.video[result.trusted], recorded.truth(3, 8)) > 25.5
