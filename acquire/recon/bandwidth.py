@@ -1,9 +1,9 @@
 """Estimate of the scene's bandwidth from the lines alone: from coarse voxels, and from the fastest lamp.
 
-A few iterations on about 24 × 24 voxels with a quarter of the sub-steps' cosines take a second. What the coarse voxels
-cannot represent spreads evenly over all coefficients, so that their upper half shows the height of that
-floor; the bandwidth ends with the last coefficient that rises above it, plus a margin. A scene whose light
-reaches into the upper half shows by peaks there; then the whole quarter is used.
+A few iterations on about 24 × 24 voxels with a quarter of the sub-steps' cosines take a second. What the
+coarse voxels cannot represent spreads evenly over all coefficients, so that their upper half shows the height
+of that floor; the bandwidth ends with the last coefficient that rises above it, plus a margin. A scene whose
+light reaches into the upper half shows by peaks there; then the whole quarter is used.
 
 A lamp of a few thousand hertz can drown in that floor, with some codes, and with all on a large sensor, where
 a coarse voxel covers many pixels. A lamp of steady rhythm stands out in the covariance of the lines (`lamps`)
