@@ -105,7 +105,7 @@ def test_two_recordings_of_an_interrupted_sweep_are_enough_and_one_is_not(tmp_pa
     late = delay([one, other]).quantities["light_late_ticks"]
     assert late.value == pytest.approx([300, 300], abs=5 * late.uncertainty.max())
     assert late.uncertainty.max() < 10
-    with pytest.raises(UsageError, match="arm a: no two recordings"):
+    with pytest.raises(UsageError, match="arm a: in no two recordings"):
         delay([one])
 
 

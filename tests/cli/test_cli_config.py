@@ -95,7 +95,7 @@ def test_bad_files_name_the_key(cli: Cli, rig_file: Path, before: str, after: st
             "light.lead_ticks = 31\ndriver = 'rtl'",
             "trigger.light.lead_ticks = 31 cannot be simulated; possible: 0, or driver = 'simulated'",
         ),
-        ("driver = 'serial'\nurl = '/dev/ttyUSB0'", "trigger.driver = 'serial' cannot be simulated"),
+        ("driver = 'serial'\nurl = '/dev/ttyUSB0'", "cannot be triggered by trigger.driver = 'serial'"),
         ("driver = 'serial'", "driver 'serial' needs a url"),
         (
             "driver = 'serial'\nurl = 'x'\nbaud = 9600",

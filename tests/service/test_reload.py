@@ -80,7 +80,7 @@ def test_allowed_changes_take_effect_and_the_recording_continues(daemon: Daemon,
     assert reserves == [0.25, 0.5]
     (noted,) = [event.text for event in first.events if event.text.startswith("reload by")]
     assert noted.startswith("reload by the control socket: hooks.command = ")
-    assert noted in daemon.log.read_text()
+    until(lambda: noted in daemon.log.read_text())
 
 
 def test_a_reload_with_a_fixed_key_is_refused_as_a_whole(daemon: Daemon) -> None:
@@ -128,7 +128,7 @@ def test_a_broken_file_changes_nothing_and_is_reported(daemon: Daemon) -> None:
         until(lambda: "does not exist" in news_of(client))
         assert client.setup().config == before
         assert client.status().state is State.IDLE
-    assert "reload by SIGHUP: nothing was changed: " in daemon.log.read_text()
+    until(lambda: "reload by SIGHUP: nothing was changed: " in daemon.log.read_text())
 
 
 def test_sighup_reloads_the_page_and_the_log_level(daemon: Daemon) -> None:
@@ -162,7 +162,7 @@ def test_sighup_reloads_the_page_and_the_log_level(daemon: Daemon) -> None:
         assert daemon("reload").code == 0
         until(lambda: not answers())
         client.arm()
-        assert "idle → armed" in daemon.log.read_text()
+        until(lambda: "idle → armed" in daemon.log.read_text())
     assert daemon.end() == 0
 
 

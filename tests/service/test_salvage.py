@@ -102,7 +102,7 @@ def test_a_recorder_is_killed_twice_and_a_stop_leaves_nothing_open(start: Start)
     last = whole.segments[-1]
     assert whole.cut(last.first_line + last.lines - 50, 50).first_line == last.first_line + last.lines - 50
     assert "not sealed" in daemon("status").out
-    assert "x-2.zarr recovered: " in daemon.log.read_text()
+    until(lambda: "x-2.zarr recovered: " in daemon.log.read_text())
 
 
 def test_the_recording_of_a_killed_daemon_is_sealed_by_the_next(start: Start) -> None:

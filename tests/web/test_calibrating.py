@@ -125,4 +125,4 @@ def test_dark_flat_target_and_a_sweep_that_is_cancelled(
     assert known.alignment is not None
     assert known.alignment.alignment.rows == pytest.approx(1.4, abs=0.15)
     assert known.steps["dark"]["lines"] == 384
-    assert "arm by operator at 127.0.0.1" in daemon.log.read_text()
+    until(lambda: "arm by operator at 127.0.0.1" in daemon.log.read_text())
