@@ -184,9 +184,7 @@ class Service:
     def measure(self) -> None:
         """Measure again what the host sustains; only while idle, since a run would disturb it."""
         if self._state is not State.IDLE:
-            raise StateError(
-                f"the capacity cannot be measured while {self._state}", possible=possible(self._state)
-            )
+            raise StateError(f"measuring is impossible while {self._state}", possible=possible(self._state))
         if self._prove is None:
             raise UsageError("this rig's capacity cannot be measured", hint="acquire bench --config RIG")
         self._busy = "capacity"
