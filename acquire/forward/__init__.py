@@ -1,7 +1,7 @@
 """The forward model, Eq. (1)–(4): the lines that a scene produces, and the transpose of that map."""
 
 from acquire.forward.arms import DualArm
-from acquire.forward.blurring import Blurring, blur_matrices, blurring
+from acquire.forward.blurring import Blurring, blur_matrices, blurring, mean_weights
 from acquire.forward.gathered import GatheredArms
 from acquire.forward.merge import block_bounds, column_merging, hold_video, merge_video
 from acquire.forward.registration import Registration, interpolation_variance, registration
@@ -19,6 +19,7 @@ __all__ = [
     "column_merging",
     "hold_video",
     "interpolation_variance",
+    "mean_weights",
     "merge_video",
     "registration",
 ]

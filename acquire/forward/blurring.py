@@ -7,6 +7,8 @@ Elements are thus not negative and rows sum to 1, a uniform scene is unchanged, 
 For voxels of N_m > 1 a voxel is held over its block, the kernel is applied, and the mean over each block is
 taken; like the Gaussian, this is one matrix for rows and one for columns.
 
+The veil follows: v times the mean of the blurred frame, and 1 − v times the frame. Rows still sum to 1.
+
 If Λ′ is a product of dense factors (`acquire.recon.band`), these absorb the matrices once and nothing is done
 per frame. Otherwise frames are multiplied by them. Without a blur there are no matrices.
 """
@@ -50,16 +52,32 @@ class Blurring:
         self._pairs = [
             tuple(arrays.asarray(each) for each in pair) for pair in blur_matrices(blur, size, spatial_merge)
         ]
+        self._veil, self._xp = blur.veil, arrays.xp
+        self._mean = arrays.asarray(mean_weights(size, spatial_merge))
 
     def forward(self, arm: int, frames: Array) -> Array:
-        """Blur frames as arm 0 or 1 does."""
+        """Blur and veil frames as arm 0 or 1 does."""
         rows, columns = self._pairs[arm]
-        return rows @ frames @ columns.T
+        blurred, veil = rows @ frames @ columns.T, self._veil[arm]
+        if not veil:
+            return blurred
+        mean = (blurred @ self._mean) @ self._mean
+        return (1 - veil) * blurred + veil * mean[:, None, None]
 
     def adjoint(self, arm: int, frames: Array) -> Array:
         """Apply the transpose of `forward`."""
         rows, columns = self._pairs[arm]
+        if veil := self._veil[arm]:
+            total = self._xp.sum(frames, axis=(1, 2))
+            weights = self._mean[:, None] * self._mean[None, :]
+            frames = (1 - veil) * frames + veil * total[:, None, None] * weights
         return rows.T @ frames @ columns
+
+
+def mean_weights(size: int, spatial_merge: int = 1) -> NDArray[np.float64]:
+    """Return the share (n′,) of each block of voxels in the mean over the field: the last may be smaller."""
+    _, lengths = block_bounds(size, spatial_merge)
+    return lengths / size
 
 
 def blur_matrices(

@@ -11,6 +11,7 @@ busy-wait for one another: beside two other programs, two threads took ten times
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
@@ -25,6 +26,7 @@ from acquire.forward import (
     block_bounds,
     blur_matrices,
     column_merging,
+    mean_weights,
     registration,
 )
 
@@ -111,16 +113,34 @@ class BandOperator:
         flipped = geometry.size - starts - lengths
         factors = [staircase(lit, order, lengths, geometry) for order in (starts, flipped)]
         mergings: list[NDArray[Any]] = [merging, merging]
+        self._veils: list[Veil | None] = [None, None]
         if blur is not None:
             # along the transfer the blur goes into the factor, across it into the merging: it costs no time
             # per frame. The matrices are those of the scene's rows and columns; arm B's charge moves along
             # the latter.
             (along_a, across_a), (across_b, along_b) = blur_matrices(blur, geometry.size, spatial_merge)
+            mean = mean_weights(geometry.size, spatial_merge)
+            self._veils = [
+                None
+                if not veil
+                else Veil(
+                    asarray(along.T @ mean),
+                    asarray(across.T @ mean),
+                    asarray(veil * factor.sum(axis=1)),
+                    asarray(merging.sum(axis=0)),
+                )
+                for veil, factor, along, across in zip(
+                    blur.veil, factors, (along_a, along_b), (across_a, across_b), strict=True
+                )
+            ]
             factors = [
                 np.einsum("lqk,qp->lpk", factor, along.astype(factor.dtype), optimize=True)
                 for factor, along in zip(factors, (along_a, along_b), strict=True)
             ]
-            mergings = [across.T @ merging for across in (across_a, across_b)]
+            mergings = [
+                (1 - veil) * across.T @ merging
+                for veil, across in zip(blur.veil, (across_a, across_b), strict=True)
+            ]
         self._mergings = [asarray(each) for each in mergings]
         self._factors = [asarray(factor.reshape(geometry.lines, -1)) for factor in factors]
 
@@ -175,12 +195,44 @@ class BandOperator:
         factor, merging = self._factors[arm], self._mergings[arm]
         side, pixels = merging.shape
         blocks = self._xp.reshape(view, (-1, side))
-        return factor @ (blocks @ merging) if side > pixels else (factor @ blocks) @ merging
+        lines = factor @ (blocks @ merging) if side > pixels else (factor @ blocks) @ merging
+        return lines if (veil := self._veils[arm]) is None else lines + veil.forward(view)
 
     def _arm_adjoint(self, arm: int, lines: Array) -> Array:
+        """The transpose of `_arm`: (n′·K, n′)."""
         factor, merging = self._factors[arm], self._mergings[arm]
         side, pixels = merging.shape
-        return (factor.T @ lines) @ merging.T if side > pixels else factor.T @ (lines @ merging.T)
+        back = (factor.T @ lines) @ merging.T if side > pixels else factor.T @ (lines @ merging.T)
+        if (veil := self._veils[arm]) is None:
+            return back
+        return back + self._xp.reshape(veil.adjoint(lines), back.shape)
+
+
+@dataclass(frozen=True, slots=True)
+class Veil:
+    """What an arm's veil adds to its lines, a matrix of rank K: the mean of each coefficient, as even light.
+
+    Attributes
+    ----------
+    along, across : weights of the blurred frame's mean, along the charge and across it (n′,)
+    factor : lines of a coefficient that is 1 everywhere, times the veil (L_R, K)
+    pixels : light of an even row in each pixel (M,)
+    """
+
+    along: Array
+    across: Array
+    factor: Array
+    pixels: Array
+
+    def forward(self, view: Array) -> Array:
+        """(block, K, across) → (L_R, M)."""
+        means = self.along @ (view @ self.across)
+        return (self.factor @ means)[:, None] * self.pixels
+
+    def adjoint(self, lines: Array) -> Array:
+        """(L_R, M) → (block, K, across)."""
+        means = self.factor.T @ (lines @ self.pixels)
+        return self.along[:, None, None] * means[:, None] * self.across
 
 
 class InBasis:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING, Any
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -18,11 +20,15 @@ from acquire.forward import (
     blur_matrices,
     hold_video,
     interpolation_variance,
+    mean_weights,
     merge_video,
 )
 from acquire.forward.blurring import blur_matrix, kernel
 from acquire.forward.registration import sampling_matrix
 from acquire.geometry import Geometry
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
 
 BLUR = Blur((0.7, 0.4), (1.3, 0.9))
 
@@ -121,7 +127,8 @@ def test_each_arm_is_blurred_along_and_across_its_own_transfer() -> None:
 def cases(draw: st.DrawFn) -> tuple[Geometry, int, int, Blur, Alignment | None, int]:
     g = Geometry(draw(st.integers(1, 4)), draw(st.integers(1, 3)), draw(st.integers(1, 5)))
     sigma = st.floats(0, 3)
-    blur = Blur((draw(sigma), draw(sigma)), (draw(sigma), draw(sigma)))
+    veil = st.sampled_from([0.0, 0.02, 0.4])
+    blur = Blur((draw(sigma), draw(sigma)), (draw(sigma), draw(sigma)), veil=(draw(veil), draw(veil)))
     off = Alignment(draw(st.floats(-3, 3)), 0.4, draw(st.floats(-20, 20))) if draw(st.booleans()) else None
     merges = draw(st.integers(1, g.size)), draw(st.integers(1, g.span + 2))
     return g, *merges, blur, off, draw(st.integers(0, 2**32 - 1))
@@ -141,13 +148,20 @@ def test_the_transpose_is_exact_and_the_bound_holds(
     forward = model.forward(video)
     assert np.vdot(forward, lines) == pytest.approx(np.vdot(video, model.adjoint(lines)), abs=1e-9)
     (rows, columns), (rows_b, columns_b) = blur_matrices(blur, g.size, N_m)
-    np.testing.assert_allclose(forward[0], sharp.forward(rows @ video @ columns.T)[0], atol=1e-10)
+    mean = mean_weights(g.size, N_m)
+
+    def on_sensor(rows: NDArray[Any], frames: NDArray[Any], columns: NDArray[Any], arm: int) -> NDArray[Any]:
+        image, veil = rows @ frames @ columns.T, blur.veil[arm]
+        return np.asarray((1 - veil) * image + veil * (image @ mean @ mean)[:, None, None])
+
+    np.testing.assert_allclose(forward[0], sharp.forward(on_sensor(rows, video, columns, 0))[0], atol=1e-10)
     seen = video
     if off is not None:
         moved = sampling_matrix(off, g.size, N_m) @ video.reshape(len(video), -1).T
         seen = moved.T.reshape(video.shape)
     plain = DualArm(g, code, N_m, T_m, np.float64)
-    np.testing.assert_allclose(forward[1], plain.forward(rows_b @ seen @ columns_b.T)[1], atol=1e-10)
+    seen = on_sensor(rows_b, seen, columns_b, 1)
+    np.testing.assert_allclose(forward[1], plain.forward(seen)[1], atol=1e-10)
     bound = model.norm_bound(5)
     some = [rng.standard_normal(video.shape) for _ in range(3)]
     assert all(np.linalg.norm(model.forward(x)) <= bound * np.linalg.norm(x) for x in some)
@@ -167,3 +181,13 @@ def test_registration_blurs_by_its_interpolation_variance() -> None:
 def test_impossible_widths_are_refused(values: tuple[float, float]) -> None:
     with pytest.raises(UsageError, match="blur is impossible"):
         Blur((0, 0), values)
+
+
+@pytest.mark.parametrize("veil", [-0.1, 0.6, float("nan")])
+def test_impossible_veils_are_refused(veil: float) -> None:
+    with pytest.raises(UsageError, match="veil is impossible"):
+        Blur((0, 0), (0, 0), veil=(0.0, veil))
+
+
+def test_the_arms_exchange_their_veils() -> None:
+    assert Blur((0, 0), (0, 0), veil=(0.01, 0.03)).swapped().veil == (0.03, 0.01)

@@ -90,7 +90,7 @@ def test_the_gathered_shear_is_the_compiled_one(case: tuple[Geometry, int, int, 
     rng = np.random.default_rng(seed)
     code = rng.integers(0, 2, g.span).astype(np.uint8)
     off = Alignment(*rng.uniform(-2, 2, 2), *rng.uniform(-9, 9, 1)) if seed % 2 else None
-    blur = Blur((0.7, 0.2), (1.1, 0.9)) if seed % 4 > 1 else None
+    blur = Blur((0.7, 0.2), (1.1, 0.9), veil=(0.1, 0.02)) if seed % 4 > 1 else None
     compiled = DualArm(g, code, N_m, T_m, np.float64, off, blur)
     gathered = GatheredArms(g, code, N_m, T_m, STRICT, off, blur)
     video, lines = rng.standard_normal(compiled.video_shape), rng.standard_normal(g.lines_shape)
@@ -109,7 +109,7 @@ def test_the_band_operator_and_its_transpose(case: tuple[Geometry, int, int, int
     code = rng.integers(0, 2, g.span).astype(np.uint8)
     frames = g.video_shape(N_m, T_m)[0]
     off = Alignment(*rng.uniform(-2, 2, 2), *rng.uniform(-9, 9, 1)) if seed % 2 else None
-    blur = Blur((0.7, 0.2), (1.1, 0.9)) if seed % 4 > 1 else None
+    blur = Blur((0.7, 0.2), (1.1, 0.9), veil=(0.1, 0.02)) if seed % 4 > 1 else None
     there = BandOperator(g, code, TemporalBasis(frames, K, STRICT), N_m, T_m, off, blur)
     here = BandOperator(g, code, TemporalBasis(frames, K, DOUBLE), N_m, T_m, off, blur)
     theta, lines = rng.standard_normal(here.theta_shape), rng.standard_normal(g.lines_shape)

@@ -82,7 +82,8 @@ def test_band_operator_is_the_sensing_matrix_in_the_basis(case: tuple[Geometry, 
     basis = TemporalBasis(whole.video_shape[0], K, DOUBLE)
     off = Alignment(*rng.uniform(-2, 2, 2), *rng.uniform(-9, 9, 1)) if seed % 2 else None
     a, b = rng.uniform(0, 2, (2, 2)).tolist()
-    blur = Blur(tuple(a), tuple(b)) if seed % 4 > 1 else None
+    veil = ((0.0, 0.0), (0.03, 0.0), (0.1, 0.2))[seed % 3]
+    blur = Blur(tuple(a), tuple(b), veil=veil) if seed % 4 > 1 else None
     band, composed = (each(g, code, basis, N_m, T_m, off, blur) for each in (BandOperator, InBasis))
     theta = rng.standard_normal(band.theta_shape)
     lines = rng.standard_normal(g.lines_shape)

@@ -46,7 +46,7 @@ def segment(video: np.ndarray = TRUTH) -> Segment:
     )
 
 
-OFF, BLUR = Alignment(1.5, -0.7, 3.0, 1.02), Blur((0.8, 0.3), (1.4, 0.0))
+OFF, BLUR = Alignment(1.5, -0.7, 3.0, 1.02), Blur((0.8, 0.3), (1.4, 0.0), veil=(0.02, 0.05))
 
 
 @pytest.mark.parametrize(
