@@ -69,3 +69,7 @@ def falling(terms: tuple[float, ...], x: NDArray[Any]) -> NDArray[np.float64]:
     """Return the light 1 + t₁·x + t₂·x² at ``x``, from −1 to 1 over the field, relative to the centre."""
     first, second = terms
     return np.asarray(1 + first * x + second * x**2)
+
+
+SHARP = Blur((0.0, 0.0), (0.0, 0.0))
+"""Optics without an effect."""

@@ -17,7 +17,7 @@ splitter (%), PSNR in dB, seconds.
 --orientations draws 24 instruments instead (eight views of arm B, three targets each) and counts the answers.
 --measured takes the instrument of configs/scene-leds-measured.toml and its four lamps instead, with arm B
 displaced by three amounts; known_db has all effects that dark, flat and target do not measure. --psf also
-measures the optics' blur, from a checkerboard.
+measures the optics' blur and veil, from a checkerboard whose dark squares are black.
 """
 
 from __future__ import annotations
@@ -39,6 +39,7 @@ from acquire.calibrate.orientation import VIEWS
 from acquire.calibrate.psf import psf
 from acquire.calibrate.target import alignment, orientation
 from acquire.calibrate.transfer import transfer
+from acquire.calibrate.veil import veil
 from acquire.config import load_rig, load_scene
 from acquire.forward import merge_video
 from acquire.recon import reconstruct
@@ -227,7 +228,7 @@ def checkerboard(seed: int) -> NDArray[np.float32]:
 
 
 def calibrate(drawn: Drawn, directory: Path, lines: int, *, blur: bool = False) -> Calibration:
-    """Dark, flat, transfer, orientation, alignment, and if wanted the optics' blur."""
+    """Dark, flat, transfer, orientation, alignment, and if wanted the optics' blur and veil."""
     taken = {kind: open_exposure(drawn.record(kind, directory, lines)) for kind in ("dark", "flat", "target")}
     first = dark(taken["dark"])
     known = Calibration(first.instrument).with_step(first)
@@ -237,7 +238,9 @@ def calibrate(drawn: Drawn, directory: Path, lines: int, *, blur: bool = False) 
     known = known.with_step(alignment(taken["target"], known))
     if not blur:
         return known
-    return known.with_step(psf(open_exposure(drawn.record("edges", directory, lines)), known))
+    edges = open_exposure(drawn.record("edges", directory, lines))
+    known = known.with_step(psf(edges, known))
+    return known.with_step(veil(edges, known))
 
 
 def compared(drawn: Drawn, known: Calibration, directory: Path) -> dict[str, float]:

@@ -2,11 +2,11 @@
 
 ::
 
-    recordings ──▶ exposure ──▶ dark, flat, transfer, orientation, align, psf ──▶ Finding
-                                                                                   │
-    recording's copy ◀── Calibration ◀── file (Zarr group) ◀── with_step ◀─────────┘
+    recordings ──▶ exposure ──▶ dark, flat, transfer, orientation, align, psf, veil ──▶ Finding
+                                                                                         │
+    recording's copy ◀── Calibration ◀── file (Zarr group) ◀── with_step ◀───────────────┘
                              │
-                             └──▶ apply: a segment's offsets, responsivities, mask, alignment, blur
+                             └──▶ apply: a segment's offsets, responsivities, mask, alignment, optics
 
 A calibration holds measurements and nothing else, and a property that was not measured is not corrected.
 Lines on disk are never altered.

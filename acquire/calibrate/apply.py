@@ -1,4 +1,4 @@
-"""Application of a calibration to a segment: offsets, responsivities, mask, alignment, blur.
+"""Application of a calibration to a segment: offsets, responsivities, mask, alignment, optics.
 
 The lines themselves are not altered.
 """
@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from acquire.blur import Blur, falling
+from acquire.blur import SHARP, Blur, falling
 from acquire.calibrate.calibration import COLUMN, QUANTITIES, Calibration, Measured, differences_between
 from acquire.calibrate.curve import curve_of
 from acquire.calibrate.exposure import instrument_of
@@ -34,8 +34,8 @@ band gap (0.56 eV), is 1.4 times as large 5 K above 25 °C."""
 SLOWER = 0.01
 """Relative difference of the sub-steps from which there is a doubt. Dark current and ambient light are
 proportional to them: 1 % of 29 DN is the noise of rounding, 0.29 DN."""
-CLEAR_BLUR = 2.0
-"""Standard uncertainties by which a width must exceed 0 to be part of the model."""
+CLEAR = 2.0
+"""Standard uncertainties by which a width of the blur, or a veil, must exceed 0 to be part of the model."""
 
 
 def calibration_of(recording: Recording) -> Calibration | None:
@@ -118,6 +118,8 @@ def calibrated(segment: Segment, calibration: Calibration) -> Segment:
     if calibration.alignment is not None:
         # measured between the arms as they are turned by then
         corrected = replace(corrected, alignment=calibration.alignment.alignment)
+    if (veil := veil_of(calibration)) is not None:
+        corrected = replace(corrected, blur=replace(corrected.blur or SHARP, veil=veil))
     if belongs_to_flat(calibration):
         corrected = shaded(corrected, calibration.quantities["shading"].value)
     return _without_interpolation(corrected)
@@ -144,7 +146,7 @@ def shaded(segment: Segment, shading: NDArray[np.float64]) -> Segment:
     # the centre of the lenses passes all light
     responsivity /= np.sqrt(shading[:, 4].prod())
     a, b = (tuple(row) for row in shading[:, :4].tolist())
-    blur = replace(segment.blur or Blur((0.0, 0.0), (0.0, 0.0)), shade_a=a, shade_b=b)
+    blur = replace(segment.blur or SHARP, shade_a=a, shade_b=b)
     return replace(segment, responsivity_dn=responsivity, blur=blur)
 
 
@@ -198,9 +200,18 @@ def blur_of(calibration: Calibration) -> Blur | None:
     if "blur_px" not in calibration.quantities:
         return None
     found = calibration.quantities["blur_px"]
-    clear = np.where(found.value > CLEAR_BLUR * found.uncertainty, found.value, 0.0)
+    clear = np.where(found.value > CLEAR * found.uncertainty, found.value, 0.0)
     a, b = clear.tolist()
     return Blur(tuple(a), tuple(b)) if clear.any() else None
+
+
+def veil_of(calibration: Calibration) -> tuple[float, float] | None:
+    """Return each arm's veil, an unclear one as 0; None if none is clear or it was not measured."""
+    if "veil" not in calibration.quantities:
+        return None
+    found = calibration.quantities["veil"]
+    a, b = np.where(found.value > CLEAR * found.uncertainty, found.value, 0.0).tolist()
+    return (a, b) if a or b else None
 
 
 def _without_interpolation(segment: Segment) -> Segment:

@@ -13,6 +13,7 @@
     light_late_ticks (arm)           delay of the light relative to the charge, without lead and delays
     linearity_error  (arm)           LE of EMVA 1288
     blur_px          (arm, axis)     standard deviation of the optics' blur, along the transfer and across it
+    veil             (arm,)          share of the arm's light that its lens spreads over the whole field
     shading          (arm, term)     light on the image of the model's arms, relative to its centre
     excess_dn        (arm, knot)     excess of samples that read 0 … white, at evenly spaced knots
 
@@ -74,6 +75,7 @@ QUANTITIES = {
     "blur_px": Quantity(
         WIDTHS, "1", "standard deviation of the optics' blur along the transfer and across it, in fine pixels"
     ),
+    "veil": Quantity(ARM, "1", "share of the arm's light that its lens spreads evenly over the field"),
     "linearity_error": Quantity(ARM, "1", "linearity error of EMVA 1288"),
     "shading": Quantity(
         SHADING,
@@ -92,6 +94,7 @@ FOUND_BY = {
     "linearity": ("linearity_error", "excess_dn"),
     "delay": ("light_late_ticks",),
     "psf": ("blur_px",),
+    "veil": ("veil",),
 }
 """Step → the quantities that it measures."""
 

@@ -81,8 +81,17 @@ PSF = Step(
     ("psf",),
 )
 """It needs neither dark nor flat, since columns that differ by 3 % do not change the width of edges."""
-STEPS = (DELAY, DARK, LINEARITY, FLAT, TARGET, PSF)
+VEIL = Step(
+    "veil",
+    "Put a target in, at rest, a few percent of which send no light at all: holes in a white card before a "
+    "dark room, or chrome on glass lit from behind. Printed black is not black enough.",
+    NOISE_LINES,
+    "rig",
+    ("veil",),
+    after="dark",
+)
+STEPS = (DELAY, DARK, LINEARITY, FLAT, TARGET, PSF, VEIL)
 AT_ONCE = (DARK, FLAT, TARGET)
 """The steps of `acquire calibrate all`, with one recording each."""
-OPTIONAL = (PSF,)
+OPTIONAL = (PSF, VEIL)
 """Optional steps after those, with one recording each."""

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from acquire.blur import falling
-from acquire.calibrate.apply import CLEAR_BLUR, belongs_to_flat
+from acquire.calibrate.apply import CLEAR, belongs_to_flat
 from acquire.calibrate.calibration import Measured
 
 if TYPE_CHECKING:
@@ -17,12 +17,15 @@ if TYPE_CHECKING:
     from acquire.calibrate.check import Check
 
 PER_ARM = {
-    "balance": ("arm's light relative to the mean", ""),
-    "dn_per_electron": ("DN per electron", ""),
-    "read_noise_e": ("read noise", " e"),
-    "full_well_e": ("full well", " e"),
-    "light_late_ticks": ("light is late without delays by", " ticks"),
+    "balance": ("arm's light relative to the mean", "", 1),
+    "dn_per_electron": ("DN per electron", "", 1),
+    "read_noise_e": ("read noise", " e", 1),
+    "full_well_e": ("full well", " e", 1),
+    "light_late_ticks": ("light is late without delays by", " ticks", 1),
+    "veil": ("the lens's veil", " %", 100),
+    "linearity_error": ("linearity error", " %", 100),
 }
+"""Quantity → label, unit, and how many of the unit are 1."""
 PER_COLUMN = {
     "offset_dn": ("offset", " DN"),
     "noise_dn": ("noise", " DN"),
@@ -124,16 +127,14 @@ def _quantities(quantities: Any) -> dict[str, str]:
             f"spread {spread} over the columns of a and b, each uncertain by "
             f"{np.median(gain.uncertainty):.2%}, the worst by {gain.uncertainty.max():.2%}"
         )
-    for name, (label, unit) in PER_ARM.items():
+    for name, (label, unit, scale) in PER_ARM.items():
         if name in quantities:
-            facts[label] = _both(quantities[name], unit)
+            measured = quantities[name]
+            facts[label] = _both(Measured(scale * measured.value, scale * measured.uncertainty), unit)
     if "blur_px" in quantities:
         facts["the optics' blur"] = _blur(quantities["blur_px"])
     if "shading" in quantities:
         facts["the lens's light"] = _light(quantities["shading"])
-    if "linearity_error" in quantities:
-        error = quantities["linearity_error"]
-        facts["linearity error"] = _both(Measured(100 * error.value, 100 * error.uncertainty), " %")
     if "excess_dn" in quantities and quantities["excess_dn"].value.any():
         excess = quantities["excess_dn"]
         worst_at, ends = np.abs(excess.value).argmax(axis=1), excess.value.shape[1] - 1
@@ -149,7 +150,7 @@ def _blur(measured: Measured) -> str:
     widths = []
     for arm, row, errors in zip("ab", measured.value, measured.uncertainty, strict=True):
         for axis, value, error in zip(("along", "across"), row, errors, strict=True):
-            clear = value > CLEAR_BLUR * error
+            clear = value > CLEAR * error
             width = (
                 f"{value:.2f} ± {error:.2g}"
                 if clear

@@ -46,13 +46,26 @@ CHANGED = 1
 
 def register(app: typer.Typer) -> None:
     group = typer.Typer(no_args_is_help=True, rich_markup_mode="rich")
-    for command in (dark, ambient, linearity, flat, transfer, orientation, align, psf, delay, show, check):
+    for command in (
+        dark,
+        ambient,
+        linearity,
+        flat,
+        transfer,
+        orientation,
+        align,
+        psf,
+        veil,
+        delay,
+        show,
+        check,
+    ):
         group.command()(command)
     group.command("all")(calibrate_all)
     app.add_typer(
         group,
         name="calibrate",
-        help="Measure offsets, gains, noise, orientation, alignment and blur from recordings of known light.",
+        help="Measure the cameras, their alignment and optics from recordings of known light.",
         rich_help_panel="Rig",
     )
 
@@ -237,6 +250,32 @@ def psf(
     known, exposure = _known_or_new(out, recording), _exposure(recording, first_line, lines, begin, end)
     with stage_progress("measuring the edges"):
         found = method.psf(exposure, known)
+    _keep(out, found, json=json, new=True)
+
+
+def veil(
+    recording: RecordingArgument,
+    out: OutOption,
+    first_line: FirstLineOption = None,
+    lines: LinesOption = None,
+    begin: FromOption = None,
+    end: ToOption = None,
+    json: JsonFlag = False,
+) -> None:
+    """Measure the veil: the share of light that a lens spreads over the field. This step is optional.
+
+    Place a target before the lens, stationary, with black parts of 30 by 30 fine pixels or more that send no
+    light at all: holes in a white card before a dark room, or chrome on glass lit from behind. Printed black
+    reflects 3 to 5 % and would be mistaken for a veil. Record with the usual pseudo-random code, after the
+    step dark. 4096 lines give 0.1 % of the light. Reconstructions then correct the veil.
+
+    Example: [bold]acquire calibrate veil black.zarr --out cal.zarr[/]
+    """
+    from acquire.calibrate import veil as method
+
+    known, exposure = _known_or_new(out, recording), _exposure(recording, first_line, lines, begin, end)
+    with stage_progress("measuring the veil"):
+        found = method.veil(exposure, known)
     _keep(out, found, json=json, new=True)
 
 

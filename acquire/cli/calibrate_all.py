@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from acquire.calibrate.guide import AT_ONCE, LINES, MOST_LINES, NOISE_LINES, OPTIONAL, PSF, Step
+from acquire.calibrate.guide import AT_ONCE, LINES, MOST_LINES, NOISE_LINES, OPTIONAL, PSF, VEIL, Step
 from acquire.cli.calibrate_live import instrument, print_finding, record, save_finding, wait_for_enter
 from acquire.cli.control import SocketOption
 from acquire.cli.output import JsonFlag, note, print_json, print_warning, say
@@ -48,12 +48,18 @@ def calibrate_all(
         list[str] | None,
         typer.Option(
             metavar="STEP",
-            help="Do only this step: dark, flat, target or psf. Repeatable. Default: all steps except psf.",
+            help="Do only this step: dark, flat, target, psf or veil. Repeatable. Default: the first three.",
         ),
     ] = None,
     psf: Annotated[
         bool,
         typer.Option("--psf", help="Also measure the optical blur at the end, from a target with edges."),
+    ] = False,
+    veil: Annotated[
+        bool,
+        typer.Option(
+            "--veil", help="Also measure the lens's veil at the end, from a target with black parts."
+        ),
     ] = False,
     yes: Annotated[
         bool,
@@ -62,7 +68,7 @@ def calibrate_all(
     socket: SocketOption = None,
     json: JsonFlag = False,
 ) -> None:
-    """Calibrate the instrument run by the daemon: dark, flat and target in turn, and psf if requested.
+    """Calibrate the instrument run by the daemon: dark, flat and target in turn, psf and veil if requested.
 
     The command gives instructions before each recording and waits for Enter. Results are saved after every
     step, so that --only can continue an interrupted calibration. Afterwards the instrument is armed or idle
@@ -75,23 +81,25 @@ def calibrate_all(
         raise UsageError(f"there is no step {wrong[0]!r}", possible=", ".join(names))
     # In the order of the guide, whatever the order of the options: later steps need earlier ones.
     steps = [step for step in AT_ONCE if not only or step.name in only]
-    if psf or PSF.name in (only or ()):
-        steps.append(PSF)
+    wanted = ((PSF, psf), (VEIL, veil))
+    optional = [step for step, asked in wanted if asked or step.name in (only or ())]
+    steps += optional
     found: list[Finding] = []
     with instrument(socket, directory) as daemon:
-        if PSF in steps:  # refuse before the first recording if the rig cannot measure the blur
+        if optional:  # refuse before the first recording if the rig cannot measure the optics
+            name = optional[0].name
             config = daemon.setup().config
             if config["cameras"]["layout"] == "fibre":
                 raise UsageError(
-                    "psf: the rig has a fibre, and edges cannot be followed from one fibre band to the next",
+                    f"{name}: the rig has a fibre, which cuts the picture of a target into bands",
                     possible="a rig without a fibre",
-                    hint="leave psf out",
+                    hint=f"leave {name} out",
                 )
             if config["code"]["kind"] == "constant":
                 raise UsageError(
-                    "psf: the rig's code is constant, so that the rows of a scene cannot be separated",
+                    f"{name}: the rig's code is constant, so that the rows of a scene cannot be separated",
                     possible="a pseudo-random code: code.kind = 'prbs'",
-                    hint="leave psf out, or use a pseudo-random code in the rig file",
+                    hint=f"leave {name} out, or use a pseudo-random code in the rig file",
                 )
         for step in steps:
             count = lines or step.lines or LINES
@@ -137,7 +145,7 @@ def _evaluations(step: Step, exposure: Exposure, out: str) -> Iterator[Callable[
     The transfer is left out if a ramp was recorded (step linearity), which determines it better than one
     flat.
     """
-    from acquire.calibrate import columns, open_calibration, psf, target
+    from acquire.calibrate import columns, open_calibration, psf, target, veil
     from acquire.calibrate.transfer import transfer
 
     evaluations: dict[str, Callable[[Calibration], Finding]] = {
@@ -147,6 +155,7 @@ def _evaluations(step: Step, exposure: Exposure, out: str) -> Iterator[Callable[
         "orientation": lambda known: target.orientation(exposure, known),
         "align": lambda known: target.alignment(exposure, known),
         "psf": lambda known: psf.psf(exposure, known),
+        "veil": lambda known: veil.veil(exposure, known),
     }
     for name in step.finds:
         if name != "transfer" or "linearity" not in open_calibration(out).steps:

@@ -13,10 +13,11 @@ from typing import TYPE_CHECKING
 
 from acquire.alignment import Alignment
 from acquire.calibrate import AlignmentFound, calibrated
-from acquire.calibrate.apply import belongs_to_flat, blur_of
+from acquire.calibrate.apply import belongs_to_flat, blur_of, veil_of
 from acquire.calibrate.curve import curve_of
 from acquire.calibrate.orientation import MODEL, view_named
 from acquire.calibrate.psf import without_blur
+from acquire.calibrate.veil import without_veil
 from acquire.recon import reconstruct
 
 if TYPE_CHECKING:
@@ -122,6 +123,8 @@ def _without(known: Calibration) -> Iterator[tuple[str, Calibration]]:
         yield "arm B laid on arm A", replace(known, alignment=coinciding, tiles=())
     if blur_of(known) is not None:
         yield "the optics' blur", without_blur(known)
+    if veil_of(known) is not None:
+        yield "the lens's veil", without_veil(known)
     if belongs_to_flat(known):
         rest = {key: value for key, value in known.quantities.items() if key not in LIGHT}
         yield "the lens's light", replace(known, quantities=rest)

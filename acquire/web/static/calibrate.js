@@ -4,7 +4,7 @@ import { ask } from "./link.js";
 import { $, count, day, fill, make } from "./words.js";
 
 const REFRESH_MS = 1000;
-const TITLES = { delay: "Delay", dark: "Dark", linearity: "Linearity", flat: "Flat", target: "Target", psf: "Blur" };
+const TITLES = { delay: "Delay", dark: "Dark", linearity: "Linearity", flat: "Flat", target: "Target", psf: "Blur", veil: "Veil" };
 /** States of the daemon in which a step can use the instrument. */
 const FREE = ["idle", "armed"];
 

@@ -1,0 +1,163 @@
+"""Each arm's veil: the share of its light that the lens spreads over the field (ISO 18844), from black parts.
+
+With a veil v, an arm's image is (1 − v)·X + v·mean(X). Where a scene at rest sends no light, v·mean(X) is
+left, and the mean of the image is mean(X), so that v is the level of the black parts relative to the mean.
+That they are black is for the person to see to: the lines cannot distinguish a veil from grey paint, which
+reflects 3 to 5 % of the light, more than a lens spreads. Holes, or chrome on glass lit from behind, are black
+enough.
+
+The darkest windows of an image are dark by chance, too. Two images are therefore made (`still`), each from
+half of the lines: the windows are chosen in one and measured in the other, and the reverse. Black are all
+that the noise does not distinguish from the darkest.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+from scipy.ndimage import uniform_filter
+
+from acquire.blur import MOST_VEIL
+from acquire.calibrate.apply import calibrated
+from acquire.calibrate.calibration import Finding, Measured
+from acquire.calibrate.still import stills
+from acquire.errors import UsageError
+from acquire.lines import ARMS
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from numpy.typing import NDArray
+
+    from acquire.calibrate.calibration import Calibration
+    from acquire.calibrate.exposure import Exposure
+    from acquire.calibrate.still import Still
+    from acquire.lines import Segment
+
+MOST_LINES = 8192
+SIDE = 5
+"""Side of a window in coarse pixels."""
+BLACK = 0.01
+"""Share of the windows that has to be black; a square of twice SIDE has as many in 64 × 64 pixels."""
+AS_BLACK = 2.0
+"""Standard deviations of the noise by which a window may be brighter than the darkest and still be black."""
+HIGH = 0.06
+"""Veil from which the black parts are in doubt: good lenses have 1 to 2 %, poor ones 5 %."""
+LIGHT = 0.001
+"""Share of the light that lamps which take 0.1 µs to go out send a sub-step late: it is even, too."""
+SURE = 0.005
+"""Largest uncertainty: half of what a good lens spreads."""
+
+
+def veil(exposure: Exposure, known: Calibration) -> Finding:
+    """Measure the veil of each arm, a share of its light, from a target at rest with black parts.
+
+    Raises UsageError for a dark scene, for too much noise, for one without black parts, and for lines behind
+    a fibre or with a constant code.
+    """
+    recording = exposure.recording
+    if recording.fibre is not None:
+        raise UsageError(
+            f"{recording} shows a target behind a fibre, which has no image to compare with its mean",
+            possible="a recording without a fibre",
+        )
+    if exposure.code_value is not None:
+        raise UsageError(
+            f"{recording} has a constant code, which does not distinguish the rows of a scene",
+            possible="a pseudo-random code: code.kind = 'prbs'",
+        )
+    lines = min(exposure.lines, MOST_LINES)
+    # the images of the cameras themselves, in their own rows and columns
+    bare = replace(without_veil(known), orientation=None, alignment=None)
+    segment = calibrated(replace(exposure, lines=lines).whole(), bare)
+    S, samples = segment.geometry.substeps, segment.samples(np.float64)
+    halves = [stills(_every_second_line(segment, first)) for first in (0, 1)]
+    values, doubts = [], []
+    for arm, name in enumerate(ARMS):
+        level = float(samples[arm].mean())
+        value, doubt = _level_of_black(halves[0][arm], halves[1][arm], S, name)
+        if "offset_dn" in known.quantities:
+            # a wrong offset looks like even light
+            offset = float(known.quantities["offset_dn"].uncertainty[arm].mean())
+            doubt = float(np.hypot(doubt, offset / np.mean(np.asarray(segment.responsivity_dn)) / level))
+        if not doubt <= SURE:
+            raise _undetermined(name, f"its uncertainty is {doubt:.1%}, and {SURE:.1%} is needed")
+        if value > MOST_VEIL:
+            raise _undetermined(name, f"its darkest parts have {value:.0%} of the mean light")
+        values.append(max(value, 0.0))
+        doubts.append(doubt)
+    return Finding(
+        "veil",
+        exposure.instrument,
+        {"veil": Measured(np.array(values), np.array(doubts))},
+        facts={**exposure.facts(), "lines": lines},
+        warnings=tuple(_warnings(values, "offset_dn" in known.quantities)),
+    )
+
+
+def without_veil(known: Calibration) -> Calibration:
+    """Return the calibration without the veil."""
+    return replace(known, quantities={k: v for k, v in known.quantities.items() if k != "veil"})
+
+
+def _every_second_line(segment: Segment, first: int) -> Segment:
+    mask = np.zeros_like(segment.mask)
+    mask[:, first::2] = segment.mask[:, first::2]
+    return replace(segment, mask=mask)
+
+
+def _level_of_black(one: Still, other: Still, substeps: int, arm: str) -> tuple[float, float]:
+    """Return the level of the darkest windows relative to the mean, and its uncertainty, from two images.
+
+    Raises UsageError for an image without light.
+    """
+    first, second = (_windows(each, substeps) for each in (one, other))
+    means = [float(each.image[:, each.usable].mean()) for each in (one, other)]
+    noise = float(np.std(first - second)) / 2**0.5
+    # half of the mean is noise at most
+    if min(means) < 2 * noise:
+        raise _undetermined(arm, "there is too little light")
+    fewest = max(2, round(BLACK * first.size))
+    levels, errors = [], []
+    for chosen, measured, mean in ((first, second, means[1]), (second, first, means[0])):
+        order = np.argsort(chosen)
+        darkest = float(measured[order[:fewest]].mean())
+        # at least the darkest themselves, whose mean is another in the other half
+        count = max(fewest, int((chosen <= darkest + AS_BLACK * noise).sum()))
+        black = measured[order[:count]] / mean
+        levels.append(float(black.mean()))
+        # neighbouring windows overlap: so many are independent
+        errors.append(noise / mean / max(count / SIDE**2, 1.0) ** 0.5)
+    doubt = max(float(np.hypot(*errors)) / 2, abs(levels[1] - levels[0]) / 2)
+    return sum(levels) / 2, float(np.hypot(doubt, LIGHT))
+
+
+def _windows(still: Still, substeps: int) -> NDArray[np.float64]:
+    """Return the means over SIDE × SIDE coarse pixels around each coarse pixel whose window is inside."""
+    S, image = substeps, still.image[:, still.usable]
+    # an element is the sum over the S rows that end at its own, so that a window has S − 1 rows fewer
+    rows = SIDE * S - S + 1
+    means = uniform_filter(image, (rows, SIDE), mode="nearest")
+    inside = means[rows // 2 : means.shape[0] - rows // 2 : S, SIDE // 2 : means.shape[1] - SIDE // 2]
+    return np.asarray(inside, np.float64).ravel()
+
+
+def _warnings(values: list[float], with_offsets: bool) -> Iterator[str]:
+    for arm, value in zip(ARMS, values, strict=True):
+        if value > HIGH:
+            yield (
+                f"arm {arm}: a veil of {value:.1%} is more than lenses have; are the target's dark parts "
+                "black? Printed black is not: it reflects 3 to 5 % of the light"
+            )
+    if not with_offsets:
+        yield "no dark was measured: offsets of the columns that differ from the black level count as a veil"
+
+
+def _undetermined(arm: str, why: str) -> UsageError:
+    return UsageError(
+        f"the veil of arm {arm} cannot be measured: {why}",
+        possible="a target at rest, of which a few percent are black and send no light at all",
+        hint="holes in a white card before a dark room, or chrome on glass lit from behind; 4096 lines",
+    )
