@@ -89,7 +89,7 @@ class ArmWriter:
                 possible=f"line {self.next_line}, the next; a lost line keeps its row, flagged as missing",
             )
         for column, array in self._arrays.items():
-            rows = getattr(block, column.source)
+            rows = column.of(block)
             expected = (len(block), *array.shape.row_shape)
             if rows.shape != expected or rows.dtype != array.shape.dtype:
                 raise DataError(
@@ -97,7 +97,7 @@ class ArmWriter:
                     possible=f"{array.shape.dtype} {expected}",
                 )
         for column, array in reversed(self._arrays.items()):  # pixels last: rows that they have, all have
-            array.append(getattr(block, column.source), behind)
+            array.append(column.of(block), behind)
 
     def give_back(self) -> None:
         """Wait until the block of the last `append` may be reused."""

@@ -422,7 +422,7 @@ class Recorder:
             waiting = f"{fill} of {slots} ring slots of arm {name} wait for disk or codec"
             reason = f"too slow to write: {waiting}{self._held_up}"
             session.end(self._common_line(), reason, RunCondition.INTERRUPTED)
-        self._hold_ups.took(block.time_ns / 1e9)
+        self._hold_ups.took(block.committed_ns / 1e9)
 
     def _release(self, name: str, arm: Arm) -> None:
         """Release the arm's last block to its ring, once it is written."""
@@ -450,7 +450,7 @@ class Recorder:
         # Once one block has waited in vain, those after it do not wait at all until a tag comes again.
         now_s = time.monotonic()
         over_s = max(self._hold_ups.over_s, self._external.tags_pass_since_s(now_s))
-        waited_s = now_s - max(block.time_ns / 1e9, over_s)
+        waited_s = now_s - max(block.committed_ns / 1e9, over_s)
         is_pressing = 2 * ring.fill > ring.shape.slots and now_s > self._hold_ups.over_s + HELD_UP_S
         if waited_s > self._plan.tag_wait_s or is_pressing:
             self._waited_in_vain_for = self._tagger.confirmed_end

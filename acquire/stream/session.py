@@ -211,10 +211,9 @@ class Session:
             self._miss_until(arm, loss.end_line, loss.cause)
         unstated = Cause.MIXED if book.stored or book.missing else self.before
         self._miss_until(arm, block.first_line, unstated)
-        part = slice(book.next_line - block.first_line, self.end_line - block.first_line)
-        if part.stop <= part.start:
+        if self.reached(arm):
             return 0
-        tagged = self._tagger.tag(LineBlock(arm, book.next_line, block.pixels[part], block.flags[part]))
+        tagged = self._tagger.tag(arm, block.part(book.next_line, self.end_line))
         if arm in self.doubted:
             tagged = replace(tagged, flags=tagged.flags | np.uint16(LineFlag.CODE_CONTRADICTED))
             book.doubted += len(tagged)
@@ -348,7 +347,7 @@ class Session:
         while count:
             pixels = self._blank[:count]
             flags = np.full(len(pixels), LineFlag.MISSING, np.uint16)
-            self._writer.append(self._tagger.tag(LineBlock(arm, book.next_line, pixels, flags)))
+            self._writer.append(self._tagger.tag(arm, LineBlock(book.next_line, pixels, flags)))
             book.miss(len(pixels), cause)
             count -= len(pixels)
 
