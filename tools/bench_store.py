@@ -147,7 +147,7 @@ def written(directory: Path, memory: list[np.ndarray], count: int, codec: str, f
             for pair in blocks:
                 for one in pair:  # as the recorder does: the arms alternate between preparing and writing
                     writer.give_back(one.arm)
-                    writer.lend(one)
+                    writer.append(one, lent=True)
             writer.commit()
 
         pace = paced(work, count * memory[0].nbytes)

@@ -146,7 +146,7 @@ def _pace_of_recorder(load: Load, blocks: list[NDArray[Any]], directory: Path) -
             number, arm = divmod(k, len(ARMS))
             block = LineBlock(number * load.block_lines, blocks[k % len(blocks)], flags)
             writer.give_back(ARMS[arm])  # as the recorder does when it is behind: the arms alternate
-            writer.lend(tagger.tag(ARMS[arm], block))
+            writer.append(tagger.tag(ARMS[arm], block), lent=True)
             return load.block_lines
 
         try:

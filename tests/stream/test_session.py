@@ -41,15 +41,12 @@ class MemoryWriter:
     nearly_full: str | None = None
     packs: bool = False
 
-    def append(self, block: TaggedBlock) -> None:
+    def append(self, block: TaggedBlock, *, lent: bool = False) -> None:
         self._refuse("append")
         taken = self.blocks[block.arm]
         assert not taken or taken[-1].end_line == block.first_line, "rows must follow one another"
         # The ring takes its memory back.
         taken.append(replace(block, pixels=block.pixels.copy(), flags=block.flags.copy()))
-
-    def lend(self, block: TaggedBlock) -> None:
-        self.append(block)
 
     def give_back(self, arm: str) -> None:
         self._refuse("give_back")
