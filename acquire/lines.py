@@ -22,33 +22,26 @@ if TYPE_CHECKING:
     from acquire.converter import ConverterCurve
     from acquire.noise import Noise
 
-__all__ = ["ARMS", "LineBlock", "LineFlag", "Segment", "TaggedBlock", "merged"]
+__all__ = ["ARMS", "LineBlock", "LineFlag", "LineTable", "Segment", "TaggedBlock", "merged"]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LineBlock:
-    """Consecutive lines of one arm as the camera delivered them.
+    """Consecutive lines on their way from a camera to the disk. Each place adds what it alone knows:
 
-    ``first_line`` is the trigger's line number; ``pixels`` is (line, pixel), uint8 or uint16;
-    ``flags`` is (line) uint16 of LineFlag.
+    ::
+
+        driver ─ CameraBlock ─▶ grabber ─ LineBlock ─▶ ring ─ RingBlock ─▶ tagger ─ TaggedBlock ─▶ writer
+                 losses, its clock        the one copy        losses, when        code, time
+
+    ``first_line`` is the trigger's line number, and in front of the grabber the camera's; ``pixels`` is
+    (line, pixel), uint8 or uint16; ``flags`` is (line) uint16 of LineFlag. Neither is checked here: grabber
+    and writer do, which know what the camera has to deliver and what the recording can take.
     """
 
-    arm: str
     first_line: int
     pixels: NDArray[Any]
     flags: NDArray[np.uint16]
-
-    def __post_init__(self) -> None:
-        if self.arm not in ARMS or self.first_line < 0:
-            raise UsageError(
-                f"a line block cannot have arm {self.arm!r} and first line {self.first_line}",
-                possible=f"arm {' or '.join(ARMS)}, and line 0 or later",
-            )
-        if self.pixels.ndim != 2 or self.flags.shape != self.pixels.shape[:1]:
-            raise UsageError(
-                f"a line block cannot have pixels {self.pixels.shape} and flags {self.flags.shape}",
-                possible="pixels (lines, M) and flags (lines,)",
-            )
 
     def __len__(self) -> int:
         return len(self.flags)
@@ -56,28 +49,39 @@ class LineBlock:
     @property
     def end_line(self) -> int:
         """Number of the line after the block's last."""
-        return self.first_line + len(self)
+        return self.first_line + len(self.flags)
+
+    def part(self, first_line: int, end_line: int) -> LineBlock:
+        """Return those of the block's lines that lie from ``first_line`` on and before ``end_line``, in
+        place.
+        """
+        start = max(0, first_line - self.first_line)
+        rows = slice(start, max(start, end_line - self.first_line))
+        return LineBlock(self.first_line + start, self.pixels[rows], self.flags[rows])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class TaggedBlock:
-    """Consecutive lines with the trigger's tag of each; all arrays have the length of ``pixels``."""
+class LineTable:
+    """Code, ticks and times of consecutive lines; arrays of one value per line."""
 
-    arm: str
-    first_line: int
-    pixels: NDArray[Any]
-    flags: NDArray[np.uint16]
     code_index: NDArray[np.uint64]
     code: NDArray[np.uint8]
     tick: NDArray[np.uint64]
     time_ns: NDArray[np.int64]
 
     def __len__(self) -> int:
-        return len(self.flags)
+        return len(self.tick)
 
-    @property
-    def end_line(self) -> int:
-        return self.first_line + len(self)
+    def __getitem__(self, part: slice) -> LineTable:
+        return LineTable(self.code_index[part], self.code[part], self.tick[part], self.time_ns[part])
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TaggedBlock(LineBlock):
+    """Lines of one arm with the code and the time of each."""
+
+    arm: str
+    tags: LineTable
 
 
 @dataclass(frozen=True, slots=True, eq=False)

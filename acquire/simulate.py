@@ -210,7 +210,7 @@ def _write(
                 readout, white = read.result(), writer.spec.cameras[arm]["white_dn"]
                 full = (readout.pixels >= white).any(axis=1)
                 flags = readout.flags | np.where(full, np.uint16(LineFlag.SATURATED), np.uint16(0))
-                writer.append(tagger.tag(LineBlock(arm, first, readout.pixels, flags)))
+                writer.append(tagger.tag(arm, LineBlock(first, readout.pixels, flags)))
                 edges = np.flatnonzero(np.diff(readout.missing, prepend=False, append=False))
                 for begin, end in edges.reshape(-1, 2).tolist():
                     writer.add_gap(arm, first + begin, end - begin, Cause.CAMERA)

@@ -1,19 +1,34 @@
-"""Segments: lines in DN, and their conversion to the scene's units."""
+"""Parts of blocks; segments: lines in DN, and their conversion to the scene's units."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from acquire.errors import UsageError
 from acquire.forward import DualArm
 from acquire.geometry import Geometry
-from acquire.lines import Segment, merged
+from acquire.lines import LineBlock, Segment, merged
 from acquire.noise import Noise
 
 GEOMETRY = Geometry(3, 2, 4)
 LIGHT = np.random.default_rng(0).random(GEOMETRY.lines_shape)
 COLUMNS = np.arange(6.0).reshape(2, 3)
+
+
+@given(first=st.integers(0, 20), end=st.integers(0, 20) | st.just(1 << 62))
+def test_a_part_of_a_block_is_its_lines_within_the_range(first: int, end: int) -> None:
+    line = np.arange(5, 12)
+    block = LineBlock(5, np.repeat(line[:, None], 3, axis=1), line.astype(np.uint16))
+    part = block.part(first, end)
+    inside = [number for number in line.tolist() if first <= number < end]
+    assert part.flags.tolist() == part.pixels[:, 0].tolist() == inside
+    assert len(part) == part.end_line - part.first_line == len(inside)
+    if inside:
+        assert part.first_line == inside[0]
+        assert np.shares_memory(part.pixels, block.pixels)
 
 
 @pytest.mark.parametrize(

@@ -23,7 +23,7 @@ import numpy as np
 from acquire.clock import ClockFit
 from acquire.codes import ConstantCode
 from acquire.config.recording import usual_chunk_lines, usual_tag_chunks
-from acquire.lines import ARMS, TaggedBlock
+from acquire.lines import ARMS, LineTable, TaggedBlock
 from acquire.store import RecordingSpec, RecordingWriter, RunCondition, open_recording
 from acquire.store.codecs import crc32c, encode
 from acquire.store.files import DISK
@@ -101,10 +101,12 @@ def block(arm: str, number: int, pixels: np.ndarray) -> TaggedBlock:
         first_line=int(line[0]),
         pixels=pixels,
         flags=np.zeros(len(line), np.uint16),
-        code_index=SUBSTEPS * line,
-        code=np.full(len(line), 7, np.uint8),
-        tick=900 * line,
-        time_ns=(10_000 * line).astype(np.int64),
+        tags=LineTable(
+            code_index=SUBSTEPS * line,
+            code=np.full(len(line), 7, np.uint8),
+            tick=900 * line,
+            time_ns=(10_000 * line).astype(np.int64),
+        ),
     )
 
 
@@ -145,7 +147,7 @@ def written(directory: Path, memory: list[np.ndarray], count: int, codec: str, f
             for pair in blocks:
                 for one in pair:  # as the recorder does: the arms alternate between preparing and writing
                     writer.give_back(one.arm)
-                    writer.lend(one)
+                    writer.append(one, lent=True)
             writer.commit()
 
         pace = paced(work, count * memory[0].nbytes)

@@ -128,11 +128,11 @@ def produce(rings: dict[str, Ring], lines: dict[str, np.ndarray], line_rate_hz: 
         while time.monotonic() < begun_s + (at + BLOCK_LINES) / line_rate_hz:
             time.sleep(0.0005)
         for arm, ring in rings.items():
-            slot = ring.claim()
+            slot = ring.claim(at, BLOCK_LINES)
             assert slot is not None
             slot.pixels[:] = lines[arm][at : at + BLOCK_LINES]
             slot.flags[:] = 0
-            ring.commit(at, BLOCK_LINES)
+            ring.commit(slot)
             ring.acquire()
             ring.release()
     cores.value = (time.process_time() - used_s) / (time.monotonic() - begun_s)

@@ -8,11 +8,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import Any, Protocol
 
-if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import NDArray
+from acquire.lines import LineBlock
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,7 +47,7 @@ class CameraLoss:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class CameraBlock:
+class CameraBlock(LineBlock):
     """Consecutive lines as delivered; valid until released.
 
     ``first_line`` counts since arm, gaps included; ``pixels`` is (line, pixel), uint8 or uint16;
@@ -57,9 +55,6 @@ class CameraBlock:
     before the first; ``time_ns`` is the camera's own clock at the first line, if it has stamps.
     """
 
-    first_line: int
-    pixels: NDArray[Any]
-    flags: NDArray[np.uint16]
     losses: tuple[CameraLoss, ...] = ()
     time_ns: int | None = None
 

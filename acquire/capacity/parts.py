@@ -120,12 +120,12 @@ def _pace_of_ring(load: Load, blocks: list[NDArray[Any]]) -> Pace:
 
     def pass_through(k: int) -> int:
         # Never full: each slot is released before the next one is claimed.
-        slot = ring.claim()
+        slot = ring.claim(k * load.block_lines, load.block_lines)
         assert slot is not None
         slot.pixels[:] = blocks[k % len(blocks)]
         # As a grabber does, which looks for saturated pixels.
         slot.pixels.max()
-        ring.commit(k * load.block_lines, load.block_lines)
+        ring.commit(slot)
         ring.acquire()
         ring.release()
         return load.block_lines
@@ -144,9 +144,9 @@ def _pace_of_recorder(load: Load, blocks: list[NDArray[Any]], directory: Path) -
 
         def append(k: int) -> int:
             number, arm = divmod(k, len(ARMS))
-            block = LineBlock(ARMS[arm], number * load.block_lines, blocks[k % len(blocks)], flags)
-            writer.give_back(block.arm)  # as the recorder does when it is behind: the arms alternate
-            writer.lend(tagger.tag(block))
+            block = LineBlock(number * load.block_lines, blocks[k % len(blocks)], flags)
+            writer.give_back(ARMS[arm])  # as the recorder does when it is behind: the arms alternate
+            writer.append(tagger.tag(ARMS[arm], block), lent=True)
             return load.block_lines
 
         try:

@@ -312,7 +312,7 @@ def _write(
                 pixels = np.ascontiguousarray(source.file.rows(source.number, start, stop))
                 full = (pixels >= spec.cameras[arm]["white_dn"]).any(axis=1)
                 flags = np.where(full, LineFlag.SATURATED, 0).astype(np.uint16)
-            writer.append(tagger.tag(LineBlock(arm, spec.first_line + start, pixels, flags)))
+            writer.append(tagger.tag(arm, LineBlock(spec.first_line + start, pixels, flags)))
         if number % COMMIT_BLOCKS == 0:
             writer.commit()
         if progress is not None:

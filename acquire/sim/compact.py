@@ -12,6 +12,7 @@ from acquire.camera.base import CameraBlock, CameraIdentity
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
+    from acquire.lines import LineBlock
     from acquire.sim.devices import SimulatedCamera, SimulatedCameraOpener
 
 
@@ -36,7 +37,7 @@ class SideBySide:
     def __init__(self, opener: SideBySideOpener) -> None:
         self._opener = opener
         self._parts: list[SimulatedCamera] = [part() for part in opener.openers]
-        self._waiting: list[CameraBlock | None] = [None] * len(self._parts)
+        self._waiting: list[LineBlock | None] = [None] * len(self._parts)
         self._delivered = 0
 
     def identify(self) -> CameraIdentity:
@@ -66,20 +67,19 @@ class SideBySide:
             blocks = [block for block in self._waiting if block is not None]
             # a part that lost lines has blocks that begin and end elsewhere
             first = max(block.first_line for block in blocks)
-            end = min(block.first_line + len(block.flags) for block in blocks)
+            end = min(block.end_line for block in blocks)
             for number, block in enumerate(blocks):
-                skip = max(0, end - block.first_line)
-                rest = CameraBlock(block.first_line + skip, block.pixels[skip:], block.flags[skip:])
-                self._waiting[number] = rest if len(rest.flags) else None
+                rest = block.part(end, block.end_line)
+                self._waiting[number] = rest if len(rest) else None
             if first < end:
                 self._delivered += end - first
                 pixels: NDArray[Any] = np.zeros((end - first, self._opener.width), blocks[0].pixels.dtype)
                 flags = np.zeros(end - first, np.uint16)
                 for column, block in zip(self._opener.first_columns, blocks, strict=True):
-                    part = slice(first - block.first_line, end - block.first_line)
-                    pixels[:, column : column + block.pixels.shape[1]] = block.pixels[part]
+                    part = block.part(first, end)
+                    pixels[:, column : column + part.pixels.shape[1]] = part.pixels
                     # what is wrong with a line of one image is wrong with the sensor's line
-                    flags |= block.flags[part]
+                    flags |= part.flags
                 return CameraBlock(first, pixels, flags)
 
     def times_ns(self, first_line: int, count: int) -> NDArray[np.int64]:

@@ -47,11 +47,12 @@ class ArmWriter:
             )
             for column in layout.line_columns(spec.dtype)
         }
-        self._pixels = next(iter(self._arrays.values()))
+        self.pixels = next(iter(self._arrays.values()))
+        """The array whose rows can be lent: tags are always packed, and so copied, in the caller's thread."""
 
     @property
     def next_line(self) -> int:
-        return self._first_line + self._pixels.rows  # the last array to be appended to: see `append`
+        return self._first_line + self.pixels.rows  # the last array to be appended to: see `append`
 
     @property
     def written_rows(self) -> int:
@@ -81,7 +82,7 @@ class ArmWriter:
         self._first_line = first_line
 
     def append(self, block: TaggedBlock, behind: ThreadPoolExecutor | None) -> None:
-        """Append the block. With ``behind``, a thread that writes, it is lent until `give_back`."""
+        """Append the block. With ``behind``, a thread that writes, it is lent until `pixels` give it back."""
         # All is checked before any array takes a row: the arrays of an arm have the same rows.
         if block.first_line != self.next_line:
             raise DataError(
@@ -89,7 +90,7 @@ class ArmWriter:
                 possible=f"line {self.next_line}, the next; a lost line keeps its row, flagged as missing",
             )
         for column, array in self._arrays.items():
-            rows = getattr(block, column.source)
+            rows = column.of(block)
             expected = (len(block), *array.shape.row_shape)
             if rows.shape != expected or rows.dtype != array.shape.dtype:
                 raise DataError(
@@ -97,11 +98,7 @@ class ArmWriter:
                     possible=f"{array.shape.dtype} {expected}",
                 )
         for column, array in reversed(self._arrays.items()):  # pixels last: rows that they have, all have
-            array.append(getattr(block, column.source), behind)
-
-    def give_back(self) -> None:
-        """Wait until the block of the last `append` may be reused."""
-        self._pixels.give_back()
+            array.append(column.of(block), behind)
 
     def pad(self) -> None:
         for array in self._arrays.values():

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import dataclass, field
+from operator import attrgetter
 from typing import TYPE_CHECKING, Any
 
 from acquire.flags import LineFlag
@@ -21,6 +22,9 @@ from acquire.store.shape import ITEM_BYTES, ArrayShape, codec_of
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
+    from numpy.typing import NDArray
+
+    from acquire.lines import TaggedBlock
     from acquire.store.shape import Codec
     from acquire.store.spec import RecordingSpec
 
@@ -52,7 +56,7 @@ NO_LINE = 2**64 - 1
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Column:
-    """One array of an arm: its name in the recording, its name in a TaggedBlock, and its attributes.
+    """One array of an arm: its name in the recording, its place in a TaggedBlock, and its attributes.
 
     ``fill`` is the value that a reader finds where nothing is on disk, and the padding of the last chunk.
     """
@@ -62,6 +66,11 @@ class Column:
     dtype: str
     attributes: dict[str, Any] = field(default_factory=dict)
     fill: int = 0
+
+    def of(self, block: TaggedBlock) -> NDArray[Any]:
+        """Return the block's rows of this array."""
+        rows: NDArray[Any] = attrgetter(self.source)(block)
+        return rows
 
 
 def line_columns(dtype: str) -> tuple[Column, ...]:
@@ -80,7 +89,7 @@ LINES_ATTRIBUTES = {
 TAG_COLUMNS = (
     Column(
         "code_index",
-        "code_index",
+        "tags.code_index",
         "uint64",
         {
             "long_name": "index of the exposure code's bit in the line's first sub-step",
@@ -91,7 +100,7 @@ TAG_COLUMNS = (
     ),
     Column(
         "code",
-        "code",
+        "tags.code",
         "uint8",
         {
             "long_name": "exposure code bits of the line's S new sub-steps",
@@ -100,7 +109,7 @@ TAG_COLUMNS = (
     ),
     Column(
         "tick",
-        "tick",
+        "tags.tick",
         "uint64",
         {
             "long_name": "trigger clock at which the line's read-out begins",
@@ -110,7 +119,7 @@ TAG_COLUMNS = (
     ),
     Column(
         "time",
-        "time_ns",
+        "tags.time_ns",
         "int64",
         {
             "standard_name": "time",

@@ -198,25 +198,17 @@ class RecordingWriter:
         """Bytes of chunks on disk, as encoded, both arms."""
         return sum(arm.bytes_written for arm in self._arms.values())
 
-    def append(self, block: TaggedBlock) -> None:
+    def append(self, block: TaggedBlock, *, lent: bool = False) -> None:
         """Take the next lines of one arm; its arrays may be reused afterwards.
 
-        Raises DataError if the block does not begin with the next line of its arm, or the disk fails.
+        Arrays that are ``lent`` must not change until `give_back`, which raises an error of the disk: the
+        lines may still be on their way there, so that the other arm can be served. Until then ``kill -9``
+        loses them as well. Raises DataError if the block does not begin with the next line of its arm, or the
+        disk fails.
         """
-        self._append(block, None)
-
-    def lend(self, block: TaggedBlock) -> None:
-        """Append while the lines are still on their way to the disk, so that the other arm can be served.
-
-        The block's arrays must not change until `give_back`, which raises an error of the disk; until then
-        ``kill -9`` loses its lines as well.
-        """
-        self._append(block, self._behind)
-
-    def _append(self, block: TaggedBlock, behind: ThreadPoolExecutor | None) -> None:
         self._check_alive()
         with self._failing(f"writing lines of arm {block.arm}"):
-            self._arms[block.arm].append(block, behind)
+            self._arms[block.arm].append(block, self._behind if lent else None)
         # After the arrays, which refuse a block that does not fit.
         self._overview[block.arm].add(block, self.spec.first_line)
         # Of both arms, so that an arm that is ahead does not cause commits without a new row.
@@ -232,7 +224,7 @@ class RecordingWriter:
     def give_back(self, arm: str) -> None:
         """Wait until the arrays that the arm has lent may be reused. Raises DataError if the disk failed."""
         with self._failing(f"writing lines of arm {arm}"):
-            self._arms[arm].give_back()
+            self._arms[arm].pixels.give_back()
 
     def add_gap(self, arm: str, first_line: int, count: int, cause: str) -> None:
         """List ``count`` lines of ``arm`` as lost because of ``cause``, a short name.

@@ -223,8 +223,8 @@ class Intake:
         self._counters.add("delivered", count)
         self._counters.add("preroll", preroll)
         # A frame may have more lines than a slot: the camera sets its height, the rig the slot's.
-        for at in range(preroll, count, self._ring.shape.rows):
-            part = slice(at, at + self._ring.shape.rows)
+        for at in range(preroll, count, shape.rows):
+            part = slice(at, at + shape.rows)
             self._put(first + at, block.pixels[part], block.flags[part])
         self._next = first + count
         self._counters["next_line"] = self._next
@@ -253,6 +253,8 @@ class Intake:
                 f"{self._next - self._shift} to {first - self._shift}",
                 possible=f"the next line, or up to {self._plan.max_jump_lines} lost ones",
             )
+        if not jump:
+            return
         # If the camera reported fewer losses than its count jumped by, the rest has no specific cause; the
         # losses must add up to the jump, or the ledger would not balance.
         unexplained = jump - sum(loss.count for loss in losses)
@@ -272,18 +274,18 @@ class Intake:
 
     def _put(self, first_line: int, pixels: NDArray[Any], flags: NDArray[np.uint16]) -> None:
         count = len(flags)
-        slot = self._ring.claim()
+        slot = self._ring.claim(first_line, count)
         if slot is None:
             # Do not wait for a slot: lines dropped here have numbers and a cause, whereas a camera that runs
             # out of buffers does not always report how many lines it lost.
             self._ring.drop(first_line, count)
             self._losses.add(Loss(first_line, count, Cause.RING_FULL))
             return
-        slot.pixels[:count] = pixels
-        slot.flags[:count] = flags
+        slot.pixels[...] = pixels
+        slot.flags[...] = flags
         # The maximum of the whole block is several times cheaper than one per line, and mostly enough.
         if pixels.max() >= self._plan.white_dn:
             white = pixels.max(axis=1) >= self._plan.white_dn
-            slot.flags[:count][white] |= np.uint16(LineFlag.SATURATED)
+            slot.flags[white] |= np.uint16(LineFlag.SATURATED)
             self._counters.add("saturated", int(np.count_nonzero(white)))
-        self._ring.commit(first_line, count, self._losses.take())
+        self._ring.commit(slot, self._losses.take())

@@ -101,14 +101,13 @@ class Peek:
             block = self._ring.read(number)
             if block is None or block.end_line < end:
                 return None  # overwritten, or lines are missing in between
-            start = max(first_line, block.first_line)
-            rows, here = slice(start - first_line, end - first_line), slice(start - block.first_line, None)
-            taken = end - start
-            if taken > 0:
-                pixels[rows] = block.pixels[here][:taken]
-                flags[rows] = block.flags[here][:taken]
-                end = start
-            del block  # its views keep the memory mapped
+            part = block.part(first_line, end)
+            if len(part):
+                rows = slice(part.first_line - first_line, end - first_line)
+                pixels[rows] = part.pixels
+                flags[rows] = part.flags
+                end = part.first_line
+            del block, part  # their views keep the memory mapped
             if not self._ring.is_whole(number):
                 return None
             if end <= first_line:

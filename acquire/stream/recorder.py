@@ -35,7 +35,7 @@ from acquire.stream.messages import Began, Begin, Cancel, End, Extend, Interrupt
 from acquire.stream.opening import Notes, Opening, is_verdict
 from acquire.stream.recorder_states import BUSY, STATES, TABLE, RecorderEvent, RecorderState, after
 from acquire.stream.session import OPEN_END, Session
-from acquire.stream.stalls import HELD_UP_S, Arm, Backlog, DiskWaits, HoldUps, Lent, find_stall
+from acquire.stream.stalls import HELD_UP_S, Arm, Backlog, DiskWaits, HoldUps, find_stall
 from acquire.stream.tagger import Tagger
 from acquire.stream.window import hold, span
 
@@ -384,7 +384,7 @@ class Recorder:
         block = arm.ring.acquire()
         if block is None or not self._is_ready(arm.ring, block):
             return False
-        arm.lent = Lent(block.first_line, block.end_line)
+        arm.lent = range(block.first_line, block.end_line)
         if self._session is None:
             self._release(name, arm)
         else:
@@ -397,7 +397,6 @@ class Recorder:
         Once a ring has overflowed, the recording ends before the first line that found no room: whatever held
         the recorder up, the recording has every line that it covers.
         """
-        assert arm.lent is not None
         if (line := session.overrun(name, block)) is not None:
             self._cut_short = True
             full = f"the ring of arm {name} was full at line {line}"
@@ -422,7 +421,7 @@ class Recorder:
             waiting = f"{fill} of {slots} ring slots of arm {name} wait for disk or codec"
             reason = f"too slow to write: {waiting}{self._held_up}"
             session.end(self._common_line(), reason, RunCondition.INTERRUPTED)
-        self._hold_ups.took(block.time_ns / 1e9)
+        self._hold_ups.took(block.committed_ns / 1e9)
 
     def _release(self, name: str, arm: Arm) -> None:
         """Release the arm's last block to its ring, once it is written."""
@@ -432,9 +431,9 @@ class Recorder:
         try:
             if self._session is not None:
                 with self._waits.loop():
-                    self._session.give_back(name)
+                    self._session.writer.give_back(name)
         finally:
-            self._count(name, lent.first_line, lent.end_line)
+            self._count(name, lent.start, lent.stop)
             arm.ring.release()
 
     @property
@@ -450,7 +449,7 @@ class Recorder:
         # Once one block has waited in vain, those after it do not wait at all until a tag comes again.
         now_s = time.monotonic()
         over_s = max(self._hold_ups.over_s, self._external.tags_pass_since_s(now_s))
-        waited_s = now_s - max(block.time_ns / 1e9, over_s)
+        waited_s = now_s - max(block.committed_ns / 1e9, over_s)
         is_pressing = 2 * ring.fill > ring.shape.slots and now_s > self._hold_ups.over_s + HELD_UP_S
         if waited_s > self._plan.tag_wait_s or is_pressing:
             self._waited_in_vain_for = self._tagger.confirmed_end
@@ -488,7 +487,7 @@ class Recorder:
         counters = self._counters
         rows = {name: book.next_line - session.first_line for name, book in session.books.items()}
         counters["recorded"] = min(rows.values())
-        counters["committed"] = session.committed_lines
+        counters["committed"] = session.writer.committed_lines
         counters["draining"] = session.ending and not (self._cut_short and self._plan.goes_on)
         for name, book in session.books.items():
             counters[f"rows_{name}"] = rows[name]

@@ -41,6 +41,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from acquire.errors import DataError, UsageError
+from acquire.lines import LineBlock
 from acquire.processes.shared import WORD_BYTES, SharedBytes
 from acquire.stream.losses import MAX_LOSSES, Cause, Loss
 
@@ -128,29 +129,14 @@ class RingStatistics:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Slot:
-    """A claimed slot: views to be filled, ``pixels`` (row, pixel) and ``flags`` (row)."""
-
-    pixels: NDArray[Any]
-    flags: NDArray[np.uint16]
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class RingBlock:
+class RingBlock(LineBlock):
     """A whole block in the ring: views that are valid until it is released.
 
-    ``time_ns`` is the host's monotonic clock at commit; ``losses`` are the lines lost just before.
+    ``committed_ns`` is the host's monotonic clock at commit; ``losses`` are the lines lost just before.
     """
 
-    first_line: int
-    pixels: NDArray[Any]
-    flags: NDArray[np.uint16]
-    time_ns: int
+    committed_ns: int
     losses: tuple[Loss, ...]
-
-    @property
-    def end_line(self) -> int:
-        return self.first_line + len(self.flags)
 
 
 class Ring:
@@ -170,18 +156,19 @@ class Ring:
             self._memory.words(shape.control_words + k * _HEADER_WORDS, _HEADER_WORDS)
             for k in range(shape.slots)
         ]
-        self._slots: list[Slot] = []
+        self._slots: list[tuple[NDArray[Any], NDArray[np.uint16]]] = []
+        """Pixels (row, pixel) and flags (row) of each."""
         for k in range(shape.slots):
             at = shape.flags_offset + k * shape.rows * 2
             flags = np.frombuffer(self._memory.map, np.uint16, shape.rows, at)
             at = shape.pixels_offset + k * shape.slot_stride
             pixels = np.frombuffer(self._memory.map, shape.dtype, shape.rows * shape.width, at)
-            self._slots.append(Slot(pixels.reshape(shape.rows, shape.width), flags))
+            self._slots.append((pixels.reshape(shape.rows, shape.width), flags))
 
     # ---- producer
 
-    def claim(self) -> Slot | None:
-        """Return the next slot to fill, or None if the ring is full."""
+    def claim(self, first_line: int, count: int) -> LineBlock | None:
+        """Return ``count`` lines from ``first_line`` on, to be filled in place; None if the ring is full."""
         head = self._control[_HEAD]
         if head - self._control[_TAIL] == self.shape.slots:
             return None
@@ -189,14 +176,16 @@ class Ring:
         # Before a pixel is touched: an observer that still reads the slot's old block then finds the number
         # odd, and rejects the block.
         self._headers[index][_SEQUENCE] = 2 * head + 1
-        return self._slots[index]
+        pixels, flags = self._slots[index]
+        return LineBlock(first_line, pixels[:count], flags[:count])
 
-    def commit(self, first_line: int, count: int, losses: Sequence[Loss] = ()) -> None:
-        """Hand over the claimed slot's first ``count`` rows, as lines from ``first_line`` on."""
+    def commit(self, block: LineBlock, losses: Sequence[Loss] = ()) -> None:
+        """Hand over the lines that were claimed last, now filled, and those lost just before them."""
         if len(losses) > MAX_LOSSES:
             raise UsageError(
                 f"one ring slot cannot have {len(losses)} losses before it", possible=f"up to {MAX_LOSSES}"
             )
+        first_line, count = block.first_line, len(block.flags)
         head, total = self._control[_HEAD], self.committed_lines + count
         header = self._headers[head % self.shape.slots]
         header[_FIRST_LINE], header[_COUNT] = first_line, count
@@ -357,7 +346,7 @@ class Ring:
 
         A reader that is not waited for must check `is_whole` again after having used the block.
         """
-        header, slot = self._header(number), self._slots[number % self.shape.slots]
+        header, (pixels, flags) = self._header(number), self._slots[number % self.shape.slots]
         if not self.is_whole(number):
             return None
         count = header[_COUNT]
@@ -369,9 +358,9 @@ class Ring:
             )
         block = RingBlock(
             first_line=header[_FIRST_LINE],
-            pixels=slot.pixels[:count],
-            flags=slot.flags[:count],
-            time_ns=header[_TIME_NS],
+            pixels=pixels[:count],
+            flags=flags[:count],
+            committed_ns=header[_TIME_NS],
             losses=losses,
         )
         return block if self.is_whole(number) else None  # the header may be another block's by now

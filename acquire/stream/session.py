@@ -65,8 +65,7 @@ class Writer(Protocol):
     def nearly_full(self) -> str | None: ...
     @property
     def packs(self) -> bool: ...
-    def append(self, block: TaggedBlock) -> None: ...
-    def lend(self, block: TaggedBlock) -> None: ...
+    def append(self, block: TaggedBlock, *, lent: bool = False) -> None: ...
     def give_back(self, arm: str) -> None: ...
     def add_gap(self, arm: str, first_line: int, count: int, cause: str) -> None: ...
     def add_event(self, kind: str, tick: int, line: int, text: str = "") -> None: ...
@@ -132,6 +131,7 @@ class Session:
 
     Attributes
     ----------
+    writer : the recording's, which has the arms' last blocks until it has given them back
     lost : arm → why it will deliver no more
     doubted : arms whose lines contradict the code at the moment: their next lines are flagged
     trigger : the trigger's counts during this recording
@@ -162,7 +162,7 @@ class Session:
         self.surplus: dict[str, int] = {}
         self.bridges_to = -1
         self.verified: dict[str, int] = {}
-        self._writer = writer
+        self.writer = writer
         self._tagger = tagger
         self._blank = blank
         self._floor = RunCondition.GOOD
@@ -189,11 +189,6 @@ class Session:
         lines = [book.next_line for book in self.books.values()]
         return max(lines) - min(lines)
 
-    @property
-    def committed_lines(self) -> int:
-        """Rows that a reader finds."""
-        return self._writer.committed_lines
-
     def reached(self, arm: str) -> bool:
         """Return whether the arm has all its rows."""
         return self.books[arm].next_line >= self.end_line
@@ -202,7 +197,7 @@ class Session:
         """Write the block's losses, and its lines that are in range; return the number of these lines.
 
         In a ``hurry``, or if lines are packed, the block may still be on its way to the disk afterwards: it
-        is lent to the writer until `give_back`.
+        is lent to the writer until `Writer.give_back`.
         """
         book = self.books[arm]
         if block.end_line <= book.next_line:
@@ -211,15 +206,14 @@ class Session:
             self._miss_until(arm, loss.end_line, loss.cause)
         unstated = Cause.MIXED if book.stored or book.missing else self.before
         self._miss_until(arm, block.first_line, unstated)
-        part = slice(book.next_line - block.first_line, self.end_line - block.first_line)
-        if part.stop <= part.start:
+        if self.reached(arm):
             return 0
-        tagged = self._tagger.tag(LineBlock(arm, book.next_line, block.pixels[part], block.flags[part]))
+        tagged = self._tagger.tag(arm, block.part(book.next_line, self.end_line))
         if arm in self.doubted:
             tagged = replace(tagged, flags=tagged.flags | np.uint16(LineFlag.CODE_CONTRADICTED))
             book.doubted += len(tagged)
         # Packing takes longer than writing: it is done in parallel, while the other arm's lines are taken.
-        (self._writer.lend if hurry or self._writer.packs else self._writer.append)(tagged)
+        self.writer.append(tagged, lent=hurry or self.writer.packs)
         book.store(tagged.flags)
         return len(tagged)
 
@@ -243,10 +237,6 @@ class Session:
         self.end_line = line
         self._end_known = True
         self._floor = _worse(self._floor, RunCondition.INTERRUPTED)
-
-    def give_back(self, arm: str) -> None:
-        """Wait until the block that was given to the arm's `take` may be reused."""
-        self._writer.give_back(arm)
 
     def give_up(self, arm: str) -> None:
         """Fill the remaining rows of a lost arm."""
@@ -281,17 +271,17 @@ class Session:
     def mismatches(self, found: list[TagMismatch]) -> None:
         """Note tags that contradict the line count; all are counted, the first ones are listed."""
         for mismatch in found[: max(0, MAX_MISMATCH_EVENTS - self._mismatches)]:
-            self._writer.add_event("tag_mismatch", mismatch.tag.tick, mismatch.tag.line, str(mismatch))
+            self.writer.add_event("tag_mismatch", mismatch.tag.tick, mismatch.tag.line, str(mismatch))
         self._mismatches += len(found)
 
     def commit(self) -> None:
         """Make the written rows visible to readers; a disk that is nearly full ends the recording."""
-        self._writer.commit()
+        self.writer.commit()
         # Uncommitted gaps are kept for `close` after a write error, which removes rows that are not on disk
         # from the books.
-        committed = self.first_line + self._writer.committed_lines
+        committed = self.first_line + self.writer.committed_lines
         self._gaps = [gap for gap in self._gaps if gap[1].stop > committed]
-        if (reason := self._writer.nearly_full) is not None and not self._end_known:
+        if (reason := self.writer.nearly_full) is not None and not self._end_known:
             self.end(max(book.next_line for book in self.books.values()), reason, RunCondition.INTERRUPTED)
 
     def close(self, error: Exception | None = None) -> Sealed:
@@ -305,11 +295,11 @@ class Session:
                 error = found
         reason = f"write error: {_words(error)}"
         try:
-            self._leave_out(self._writer.rescue())
+            self._leave_out(self.writer.rescue())
             return self._seal(RunCondition.ABORTED, reason)
         except (AcquireError, OSError) as second:
-            self._leave_out(self._writer.committed_lines)
-            self._writer.close()
+            self._leave_out(self.writer.committed_lines)
+            self.writer.close()
             reason = f"{reason}; not sealed: {_words(second)}"
             return Sealed(RunCondition.ABORTED, reason, self._ledger(), on_disk=False)
 
@@ -334,7 +324,7 @@ class Session:
 
     def _seal(self, condition: RunCondition, reason: str) -> Sealed:
         ledger = self._ledger()
-        self._writer.seal(condition, reason, ledger)
+        self.writer.seal(condition, reason, ledger)
         return Sealed(condition, reason, ledger)
 
     def _miss_until(self, arm: str, line: int, cause: Cause) -> None:
@@ -342,13 +332,13 @@ class Session:
         count = min(line, self.end_line) - book.next_line
         if count <= 0:
             return
-        self._writer.add_gap(arm, book.next_line, count, cause)
+        self.writer.add_gap(arm, book.next_line, count, cause)
         self._gaps.append((arm, range(book.next_line, book.next_line + count), cause))
         # In pieces of one block: a gap may be many rings long, and blank rows take memory.
         while count:
             pixels = self._blank[:count]
             flags = np.full(len(pixels), LineFlag.MISSING, np.uint16)
-            self._writer.append(self._tagger.tag(LineBlock(arm, book.next_line, pixels, flags)))
+            self.writer.append(self._tagger.tag(arm, LineBlock(book.next_line, pixels, flags)))
             book.miss(len(pixels), cause)
             count -= len(pixels)
 
@@ -392,7 +382,7 @@ class Session:
         }
 
     def _note(self, kind: str, line: int, text: str) -> None:
-        self._writer.add_event(kind, int(self._tagger.table(line, 1).tick[0]), line, text)
+        self.writer.add_event(kind, int(self._tagger.table(line, 1).tick[0]), line, text)
 
 
 def _words(error: Exception) -> str:

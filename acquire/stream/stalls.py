@@ -124,14 +124,6 @@ class HoldUps:
             self.longest_s = 0.0
 
 
-@dataclass(frozen=True, slots=True)
-class Lent:
-    """The lines of a block that may still be on its way to the disk."""
-
-    first_line: int
-    end_line: int
-
-
 class Arm:
     """The recorder's view of a ring: its last sign of life, its backlog, the block being written, and the
     lines that recordings hold already.
@@ -140,7 +132,8 @@ class Arm:
     def __init__(self, ring: Ring) -> None:
         self.ring = ring
         self.backlog = Backlog()
-        self.lent: Lent | None = None
+        self.lent: range | None = None
+        """The lines of the block that may still be on its way to the disk."""
         self.kept = Kept()
         self.alive_s = time.monotonic()
         self._newest = ring.newest_line

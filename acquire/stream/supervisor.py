@@ -285,13 +285,13 @@ class Supervisor:
         rows = self._tags.shape.rows
         for at in range(0, len(tags), rows):
             some = tags[at : at + rows]
-            slot = self._tags.claim()
+            slot = self._tags.claim(0, len(some))  # the rows are tags, and have no line numbers
             if slot is None:
                 # The recorder is late. Do not wait for it: later tags confirm the same lines.
                 self._tags.drop(some[0].line, len(some))
                 continue
-            slot.pixels[: len(some)] = tag_rows(some)
-            self._tags.commit(0, len(some))  # the rows of this ring are tags, and have no line numbers
+            slot.pixels[:] = tag_rows(some)
+            self._tags.commit(slot)
         return tags
 
     def _query_trigger(self, now_s: float) -> None:

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from acquire.geometry import Geometry
-from acquire.lines import LineFlag, TaggedBlock
+from acquire.lines import LineFlag, LineTable, TaggedBlock
 from acquire.trigger.base import LineTag
 
 if TYPE_CHECKING:
@@ -48,22 +48,6 @@ class TagMismatch:
             f"tag of line {tag.line}: code index {tag.code_index}, tick {tag.tick}; "
             f"expected {expected.code_index} and {expected.tick}"
         )
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class LineTable:
-    """Code, ticks and times of consecutive lines; arrays of one value per line."""
-
-    code_index: NDArray[np.uint64]
-    code: NDArray[np.uint8]
-    tick: NDArray[np.uint64]
-    time_ns: NDArray[np.int64]
-
-    def __len__(self) -> int:
-        return len(self.tick)
-
-    def __getitem__(self, part: slice) -> LineTable:
-        return LineTable(self.code_index[part], self.code[part], self.tick[part], self.time_ns[part])
 
 
 def tag_rows(tags: Sequence[LineTag]) -> NDArray[np.uint64]:
@@ -112,24 +96,15 @@ class Tagger:
         suspects = np.union1d(np.flatnonzero(wrong), right[back])
         return [TagMismatch(LineTag(*map(int, rows[k])), LineTag(*map(int, expected[k]))) for k in suspects]
 
-    def tag(self, block: LineBlock) -> TaggedBlock:
-        """Return the block with code and time; lines that no tag has confirmed so far are flagged."""
-        table = self.table(block.first_line, len(block))
+    def tag(self, arm: str, block: LineBlock) -> TaggedBlock:
+        """Return the arm's lines with code and time; those that no tag has confirmed so far are flagged."""
         flags = block.flags
         confirmed = max(0, self.confirmed_end - block.first_line)
         if confirmed < len(block):
             flags = flags.copy()  # they are in the ring, where observers read them
             flags[confirmed:] |= UNCONFIRMED
-        return TaggedBlock(
-            arm=block.arm,
-            first_line=block.first_line,
-            pixels=block.pixels,
-            flags=flags,
-            code_index=table.code_index,
-            code=table.code,
-            tick=table.tick,
-            time_ns=table.time_ns,
-        )
+        table = self.table(block.first_line, len(block))
+        return TaggedBlock(block.first_line, block.pixels, flags, arm, table)
 
     def table(self, first_line: int, count: int) -> LineTable:
         """Return the table of ``count`` lines from ``first_line`` on, a slice of one that both arms share."""

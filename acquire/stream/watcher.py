@@ -217,10 +217,8 @@ class Intake:
             return
         lost = max(0, block.first_line - self.first_line - self._count)
         self._count = min(self._count + lost, len(self._energy))
-        start = self.first_line + self._count - block.first_line
-        part = slice(start, start + len(self._energy) - self._count)
-        usable = (block.flags[part] & NO_IMAGE) == 0
-        pixels = block.pixels[part]
+        part = block.part(self.first_line + self._count, self.first_line + len(self._energy))
+        usable, pixels = (part.flags & NO_IMAGE) == 0, part.pixels
         if not usable.all():
             pixels = pixels[usable]
         # Evenly spaced columns and lines: the mean of all would take a processor at 100 kHz, and the code

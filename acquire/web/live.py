@@ -153,7 +153,7 @@ class _ArmReader:
             first_line, flags, lost = block.first_line, block.flags.copy(), bool(block.losses)
             lines = self._decimator.sampled_lines(first_line, len(flags))
             pixels = block.pixels[lines - first_line]  # a copy, because the block may be overwritten any time
-            newest_ns = block.time_ns
+            newest_ns = block.committed_ns
             del block  # a view of the ring would keep its memory mapped
             if self._peek.took():  # the block was not overwritten while it was copied
                 self._decimator.add(first_line, flags, lines, pixels, lost=lost)

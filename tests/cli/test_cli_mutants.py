@@ -170,7 +170,7 @@ def templates(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
             tagger = Tagger(trigger_run(LOAD), SPEC.stages, CLOCK)
             for arm in ARMS:
                 pixels, flags = np.ones((LINES, LOAD.pixels), np.uint16), np.zeros(LINES, np.uint16)
-                writer.append(tagger.tag(LineBlock(arm, 100, pixels, flags)))
+                writer.append(tagger.tag(arm, LineBlock(100, pixels, flags)))
             writer.add_event("mark", 5, 110, "x")
             writer.commit()
             if state == "sealed":

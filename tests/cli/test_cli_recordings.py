@@ -17,7 +17,7 @@ import zarr
 from acquire.cli.recording_page import CELL_CHARACTERS
 from acquire.clock import ClockFit
 from acquire.codes import PrbsCode
-from acquire.lines import ARMS, LineFlag, TaggedBlock
+from acquire.lines import ARMS, LineFlag, LineTable, TaggedBlock
 from acquire.store import RecordingSpec, RecordingWriter, Retention, RunCondition, open_recording, write_video
 from acquire.store.suspect import DOUBTFUL, VERIFIED
 
@@ -54,10 +54,12 @@ def block(arm: str, lost: range) -> TaggedBlock:
         first_line=FIRST,
         pixels=np.full((LINES, M), 7 if arm == "a" else 9, np.uint16),
         flags=flags,
-        code_index=S * line,
-        code=np.packbits(bits, axis=1, bitorder="little")[:, 0],
-        tick=900 * S * line,
-        time_ns=(20_000 * line).astype(np.int64),
+        tags=LineTable(
+            code_index=S * line,
+            code=np.packbits(bits, axis=1, bitorder="little")[:, 0],
+            tick=900 * S * line,
+            time_ns=(20_000 * line).astype(np.int64),
+        ),
     )
 
 

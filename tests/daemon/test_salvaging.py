@@ -44,7 +44,7 @@ def leave_open(path: Path, lines: int = 0) -> Path:
         tagger = Tagger(trigger_run(LOAD), LOAD.stages, CLOCK)
         for arm in ARMS if lines else ():
             pixels, flags = np.ones((lines, LOAD.pixels), np.uint16), np.zeros(lines, np.uint16)
-            writer.append(tagger.tag(LineBlock(arm, writer.next_line(arm), pixels, flags)))
+            writer.append(tagger.tag(arm, LineBlock(writer.next_line(arm), pixels, flags)))
         writer.commit()
     return path
 

@@ -85,7 +85,7 @@ def fill(writer: RecordingWriter, lines: int) -> None:
     tagger = Tagger(trigger_run(LOAD), LOAD.stages, CLOCK)
     for arm in ARMS:
         pixels, flags = np.zeros((lines, LOAD.pixels), np.uint16), np.zeros(lines, np.uint16)
-        writer.append(tagger.tag(LineBlock(arm, writer.next_line(arm), pixels, flags)))
+        writer.append(tagger.tag(arm, LineBlock(writer.next_line(arm), pixels, flags)))
     writer.commit()
 
 

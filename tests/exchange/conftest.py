@@ -49,7 +49,7 @@ def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
                 pixels[LOST.start - FIRST : LOST.stop - FIRST] = 0
                 flags[LOST.start - FIRST : LOST.stop - FIRST] = LineFlag.MISSING
                 writer.add_gap(arm, LOST.start, len(LOST), "ring_full")
-            writer.append(tagger.tag(LineBlock(arm, FIRST, pixels, flags)))
+            writer.append(tagger.tag(arm, LineBlock(FIRST, pixels, flags)))
         writer.seal(RunCondition.INCOMPLETE, "stopped", {})
     return path
 

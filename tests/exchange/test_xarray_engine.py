@@ -80,7 +80,7 @@ def test_a_growing_recording_is_consistent_wherever_it_is_opened(tmp_path: Path)
             first = FIRST + 12 * number
             pixels = np.repeat(np.arange(first, first + 12, dtype=np.uint8)[:, None], 6, axis=1)
             for arm in ARMS:
-                writer.append(tagger.tag(LineBlock(arm, first, pixels, np.zeros(12, np.uint16))))
+                writer.append(tagger.tag(arm, LineBlock(first, pixels, np.zeros(12, np.uint16))))
             if number % 2:
                 writer.commit()
             seen.append(_rows(path))

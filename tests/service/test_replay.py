@@ -15,7 +15,7 @@ from s3_server import S3Server
 from acquire.cli import replay
 from acquire.clock import ClockFit
 from acquire.codes import PrbsCode
-from acquire.lines import ARMS, LineFlag, TaggedBlock
+from acquire.lines import ARMS, LineFlag, LineTable, TaggedBlock
 from acquire.store import RecordingSpec, RecordingWriter, RunCondition, open_recording, recover
 
 M, S, FIRST, LINES, PERIOD = 8, 2, 1001, 3000, 9000
@@ -73,16 +73,7 @@ def hard_recording(
                 code[400] ^= 1
                 ticks[500] += np.uint64(1)
             writer.append(
-                TaggedBlock(
-                    arm=arm,
-                    first_line=FIRST,
-                    pixels=pixels,
-                    flags=flags,
-                    code_index=S * line,
-                    code=code,
-                    tick=ticks,
-                    time_ns=clock.time_ns(tick),
-                )
+                TaggedBlock(FIRST, pixels, flags, arm, LineTable(S * line, code, ticks, clock.time_ns(tick)))
             )
         if seal:
             writer.seal(RunCondition.INCOMPLETE, "stopped", {})

@@ -10,7 +10,7 @@ import numpy as np
 from acquire.clock import ClockFit
 from acquire.codes import PrbsCode
 from acquire.geometry import Geometry
-from acquire.lines import ARMS, TaggedBlock
+from acquire.lines import ARMS, LineTable, TaggedBlock
 from acquire.store import RecordingSpec
 
 if TYPE_CHECKING:
@@ -64,10 +64,12 @@ class Truth:
             first_line=first,
             pixels=self.pixels(arm, line),
             flags=np.where(line % 50 == 49, 8, 0).astype(np.uint16),
-            code_index=(S * line).astype(np.uint64),
-            code=np.packbits(bits, axis=1, bitorder="little")[:, 0],
-            tick=tick,
-            time_ns=spec.clock.time_ns(tick),
+            tags=LineTable(
+                code_index=(S * line).astype(np.uint64),
+                code=np.packbits(bits, axis=1, bitorder="little")[:, 0],
+                tick=tick,
+                time_ns=spec.clock.time_ns(tick),
+            ),
         )
 
     def pixels(self, arm: str, line: np.ndarray) -> np.ndarray:
@@ -83,11 +85,23 @@ class Truth:
         return {
             "lines": block.pixels,
             "flags": block.flags,
-            "code_index": block.code_index,
-            "code": block.code,
-            "tick": block.tick,
-            "time": block.time_ns,
+            "code_index": block.tags.code_index,
+            "code": block.tags.code,
+            "tick": block.tags.tick,
+            "time": block.tags.time_ns,
         }
+
+
+def array_of(block: TaggedBlock, name: str) -> np.ndarray:
+    """The block's pixels, its flags or one of its tags."""
+    return getattr(block if name in ("pixels", "flags") else block.tags, name)
+
+
+def with_array(block: TaggedBlock, name: str, values: np.ndarray) -> TaggedBlock:
+    """The block with other pixels, flags or tags."""
+    if name in ("pixels", "flags"):
+        return replace(block, **{name: values})
+    return replace(block, tags=replace(block.tags, **{name: values}))
 
 
 def fill(writer: RecordingWriter, lines: int, block_lines: int = 37) -> None:

@@ -6,10 +6,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from store_helpers import CLOCK, Truth, make_spec
+from store_helpers import CLOCK, Truth, array_of, make_spec, with_array
 
 from acquire.clock import ClockFit
-from acquire.lines import ARMS
+from acquire.lines import ARMS, LineTable
 from acquire.store import RecordingWriter, RunCondition, open_recording
 from acquire.store.compare import compare
 
@@ -32,9 +32,10 @@ def write(path, again, change=lambda arm, block: block, lost=LOST):
                 writer.add_gap(arm, begin + rows.start, len(rows), "camera")
             block = replace(block, first_line=begin, flags=flags)
             if again:
-                tick = block.tick - spec.substeps * FIRST * spec.substep_ticks + LATER_TICKS
-                index = block.code_index - np.uint64(spec.substeps * FIRST)
-                block = replace(block, tick=tick, time_ns=clock.time_ns(tick), code_index=index)
+                tick = block.tags.tick - spec.substeps * FIRST * spec.substep_ticks + LATER_TICKS
+                index = block.tags.code_index - np.uint64(spec.substeps * FIRST)
+                tags = LineTable(index, block.tags.code, tick, clock.time_ns(tick))
+                block = replace(block, tags=tags)
             writer.append(change(arm, block))
         writer.seal(RunCondition.GOOD, "stopped", {})
     return open_recording(path)
@@ -56,9 +57,9 @@ def changed(name, row):
 
     def change(arm, block):
         if arm == "b":
-            values = getattr(block, name).copy()
+            values = array_of(block, name).copy()
             values[row] += 1 if name != "flags" else 8
-            return replace(block, **{name: values})
+            return with_array(block, name, values)
         return block
 
     return change
@@ -87,7 +88,7 @@ def test_a_tick_that_differs_takes_its_time_with_it(stored, tmp_path):
 
 def test_arms_that_slip_against_each_other_are_no_offset(stored, tmp_path):
     def slipped(arm, block):
-        return replace(block, tick=block.tick + np.uint64(arm == "b"))
+        return with_array(block, "tick", block.tags.tick + np.uint64(arm == "b"))
 
     found = compare(stored, write(tmp_path / "again.zarr", again=True, change=slipped))
     assert {one.array: one.rows for one in found}["b/tick"] == LINES - sum(map(len, LOST))
@@ -113,11 +114,7 @@ def test_fewer_lines_differ(stored, tmp_path):
         tmp_path / "again.zarr",
         again=True,
         change=lambda _, block: replace(
-            block,
-            **{
-                name: getattr(block, name)[:90]
-                for name in ("pixels", "flags", "code_index", "code", "tick", "time_ns")
-            },
+            block, pixels=block.pixels[:90], flags=block.flags[:90], tags=block.tags[:90]
         ),
     )
     (found,) = compare(stored, shorter)

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from store_helpers import CAMERA, CODE, Truth, fill, make_spec
+from store_helpers import CAMERA, CODE, Truth, array_of, fill, make_spec, with_array
 
 from acquire.errors import DataError, UsageError
 from acquire.lines import ARMS, LineFlag
@@ -37,7 +37,7 @@ def test_cut_is_what_was_recorded(sealed, first, lines):
     segment = sealed.cut(first, lines)
     truth = [Truth(make_spec()).block(arm, first, lines) for arm in ARMS]
     np.testing.assert_array_equal(segment.lines, np.stack([block.pixels for block in truth]))
-    np.testing.assert_array_equal(segment.time_ns, truth[0].time_ns)
+    np.testing.assert_array_equal(segment.time_ns, truth[0].tags.time_ns)
     np.testing.assert_array_equal(segment.code, CODE.bits(3 * first, segment.geometry.span))
     assert segment.mask.all()
     assert (segment.geometry.stages, segment.geometry.substeps, segment.geometry.lines) == (8, 3, lines)
@@ -59,10 +59,10 @@ def test_streams_are_lazy_arrays_of_one_length(sealed):
     assert stream.lines[3:5].shape == (2, 8)
     truth = Truth(make_spec()).block("b", 1000, 150)
     for array, values in (
-        (stream.code_index, truth.code_index),
-        (stream.code, truth.code),
-        (stream.tick, truth.tick),
-        (stream.time_ns, truth.time_ns),
+        (stream.code_index, truth.tags.code_index),
+        (stream.code, truth.tags.code),
+        (stream.tick, truth.tags.tick),
+        (stream.time_ns, truth.tags.time_ns),
         (stream.flags, truth.flags),
     ):
         np.testing.assert_array_equal(array[:], values)
@@ -77,7 +77,7 @@ def test_info_is_json(sealed):
     assert info["run_condition"] == "GOOD"
     assert info["line_rate_hz"] == pytest.approx(100_000 / 3)
     assert info["duration_s"] == pytest.approx(150 * 30e-6)
-    assert info["start_ns"] == Truth(make_spec()).block("a", 1000, 1).time_ns[0]
+    assert info["start_ns"] == Truth(make_spec()).block("a", 1000, 1).tags.time_ns[0]
     assert info["bytes"] == sum(f.stat().st_size for f in sealed.path.rglob("*") if f.is_file())
     assert info["simulated"] is True
     assert info["ledger"]["a"] == 1
@@ -90,7 +90,7 @@ def test_samples_that_cannot_be_used_are_masked(tmp_path):
             pixels[5, 2] = 4095
             flags[5] = LineFlag.SATURATED
             pixels[7], flags[7] = 0, LineFlag.MISSING
-            block = replace(block, code=np.where(np.arange(len(block)) == 7, 0, block.code).astype(np.uint8))
+            block = with_array(block, "code", np.where(np.arange(len(block)) == 7, 0, block.tags.code))
         else:
             flags[9] = LineFlag.INCOMPLETE | LineFlag.CODE_UNVERIFIED
         return replace(block, pixels=pixels, flags=flags)
@@ -163,10 +163,10 @@ def test_a_damaged_table_is_told_when_it_is_read_and_the_lines_stay(tmp_path, at
 @pytest.mark.parametrize("array", ["code", "code_index"])
 def test_a_code_that_disagrees_names_the_first_line(tmp_path, array):
     def change(block):
-        wrong = getattr(block, array).copy()
+        wrong = array_of(block, array).copy()
         if block.arm == "b":
             wrong[20:22] += 1
-        return replace(block, **{array: wrong})
+        return with_array(block, array, wrong)
 
     recording = write(tmp_path / "r.zarr", make_spec(), change)
     with pytest.raises(DataError, match=r"b: the code recorded with line 1020 .* \(2 of 64 lines"):

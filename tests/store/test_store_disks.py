@@ -181,7 +181,7 @@ def lend_blocks(writer, truth, sizes):
             pixels = memory[arm][: block.pixels.nbytes].view(block.pixels.dtype).reshape(block.pixels.shape)
             pixels[:] = block.pixels
             object.__setattr__(block, "pixels", pixels)
-            writer.lend(block)
+            writer.append(block, lent=True)
 
 
 @pytest.mark.parametrize("codec", ["none", "lz4"])
@@ -204,7 +204,7 @@ def test_a_disk_that_fails_while_memory_is_lent(path, allowed):
         with pytest.raises(DataError, match=r"writing lines of arm [ab]: No space left on device"):
             lend_blocks(writer, Truth(BIG), [128] * 5)
         with pytest.raises(DataError, match="no more lines"):
-            writer.lend(Truth(BIG).block("a", writer.next_line("a"), 64))
+            writer.append(Truth(BIG).block("a", writer.next_line("a"), 64), lent=True)
         for arm in ARMS:
             with contextlib.suppress(DataError):  # the other may have failed as well
                 writer.give_back(arm)

@@ -269,7 +269,7 @@ def test_blocks_that_do_not_continue_are_refused(path):
         for wrong in (
             {"pixels": block.pixels.astype(np.uint8)},
             {"pixels": block.pixels[:, :-1]},
-            {"code": block.code[:-1]},
+            {"tags": replace(block.tags, code=block.tags.code[:-1])},
         ):
             with pytest.raises(DataError, match="arm a"):
                 writer.append(replace(block, **wrong))

@@ -68,8 +68,8 @@ def test_a_killed_recording_goes_on_in_segments(killed):
     assert outage == {
         "after_line": 1079,
         "lines": 420,
-        "from_ns": int(truth.block("a", 1079, 1).time_ns[0]) + period,
-        "to_ns": int(truth.block("a", 1500, 1).time_ns[0]),
+        "from_ns": int(truth.block("a", 1079, 1).tags.time_ns[0]) + period,
+        "to_ns": int(truth.block("a", 1500, 1).tags.time_ns[0]),
         "cause": "power lost",
     }
     assert open_recording(third).attrs["segment"]["outage"]["after_line"] == 1539

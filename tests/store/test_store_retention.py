@@ -57,7 +57,7 @@ def test_lines_that_are_too_old_go_and_that_is_told(path):
         writer.seal(RunCondition.GOOD, "done", {})
     recording = open_recording(path)
     assert recording.info()["first_available_line"] == 1512
-    assert recording.info()["start_ns"] == Truth(writer.spec).block("a", 1512, 1).time_ns[0]
+    assert recording.info()["start_ns"] == Truth(writer.spec).block("a", 1512, 1).tags.time_ns[0]
     assert verify(path).intact
     assert "lines 1000 to 1511 were dropped by retention" in verify(path).notes
     assert not recover(path).changed

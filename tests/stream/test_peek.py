@@ -18,10 +18,10 @@ SHAPE = RingShape(slots=4, rows=2, width=3, dtype="uint16")
 
 
 def put(ring: Ring, number: int) -> None:
-    slot = ring.claim()
+    slot = ring.claim(2 * number, 2)
     assert slot is not None
     slot.pixels[:] = number
-    ring.commit(2 * number, 2)
+    ring.commit(slot)
 
 
 def take(ring: Ring) -> None:

@@ -103,14 +103,14 @@ class Bed:
     def offer(self, arm: str, line: int) -> None:
         """The camera's lines come while the recorder is held up, and may find the ring full."""
         ring = self.rings[arm]
-        slot = ring.claim()
+        slot = ring.claim(line, ROWS)
         if slot is None:
             ring.drop(line, ROWS)
             self.losses[arm].add(Loss(line, ROWS, Cause.RING_FULL))
             return
         slot.pixels[:] = np.arange(line, line + ROWS)[:, None]
         slot.flags[:] = 0
-        ring.commit(line, ROWS, self.losses[arm].take())
+        ring.commit(slot, self.losses[arm].take())
 
     def begin(self, path: Path, window: Window = NOW) -> int:
         """A recording without an end; its first line."""

@@ -90,7 +90,7 @@ class RingMachine(RuleBasedStateMachine):
         ),
     )
     def produce(self, lines: int, losses: list[Loss]) -> None:
-        slot = self.ring.claim()
+        slot = self.ring.claim(self.line, lines)
         assert (slot is None) == (self.head - self.tail == self.slots)
         if slot is None:
             self.ring.drop(self.line, lines)
@@ -98,9 +98,9 @@ class RingMachine(RuleBasedStateMachine):
             self.dropped_lines += lines
         else:
             self.claimed = self.head
-            slot.pixels[:lines] = pattern(self.line, lines, SHAPE.width)
-            slot.flags[:lines] = np.arange(lines)
-            self.ring.commit(self.line, lines, losses)
+            slot.pixels[:] = pattern(self.line, lines, SHAPE.width)
+            slot.flags[:] = np.arange(lines)
+            self.ring.commit(slot, losses)
             self.blocks.append((self.line, lines, tuple(losses)))
             self.peak = max(self.peak, self.head - self.tail)
         self.line += lines
@@ -108,7 +108,7 @@ class RingMachine(RuleBasedStateMachine):
     @rule()
     def claim_and_die(self) -> None:
         """Whoever comes after it claims the same slot again."""
-        if self.ring.claim() is not None:
+        if self.ring.claim(self.line, 1) is not None:
             self.claimed = self.head
 
     @rule()
@@ -195,6 +195,12 @@ TestRingMachine = RingMachine.TestCase
 TestRingMachine.settings = settings(max_examples=100, stateful_step_count=60, deadline=None)
 
 
+def put(ring: Ring, first_line: int, count: int) -> None:
+    slot = ring.claim(first_line, count)
+    assert slot is not None
+    ring.commit(slot)
+
+
 @pytest.fixture
 def ring() -> Ring:
     made = Ring("test", SHAPE)
@@ -204,11 +210,10 @@ def ring() -> Ring:
 
 def test_a_slot_overwritten_while_it_is_read_is_refused(ring: Ring) -> None:
     for line in range(SHAPE.slots):
-        ring.claim()
-        ring.commit(line, 1)
+        put(ring, line, 1)
     assert ring.acquire() is not None
     ring._control[8] = 1  # a consumer that let go too early: the producer takes the slot again
-    assert ring.claim() is not None
+    assert ring.claim(SHAPE.slots, 1) is not None
     ring._control[8] = 0
     with pytest.raises(DataError, match="torn or stale"):
         ring.release()
@@ -220,8 +225,7 @@ def test_a_wait_is_bounded_and_ends_with_a_commit(ring: Ring) -> None:
     begun = time.monotonic()
     assert ring.acquire(0.05) is None
     assert 0.05 <= time.monotonic() - begun < 60
-    ring.claim()
-    later = threading.Timer(0.05, ring.commit, (7, 2))
+    later = threading.Timer(0.05, put, (ring, 7, 2))
     later.start()
     block = ring.acquire(600)
     later.join()
@@ -231,8 +235,7 @@ def test_a_wait_is_bounded_and_ends_with_a_commit(ring: Ring) -> None:
 
 
 def test_doorbell_rings_until_hushed(ring: Ring) -> None:
-    ring.claim()
-    ring.commit(0, 1)
+    put(ring, 0, 1)
     ring.hush()
     with pytest.raises(BlockingIOError):
         os.eventfd_read(ring.fileno())
@@ -247,8 +250,7 @@ def blocks_of(first: int, end: int) -> list[range]:
 def test_history_is_taken_back_from_the_line_that_is_asked_for() -> None:
     ring = Ring("history", RingShape(slots=16, rows=10, width=1, dtype="uint8", reserve=4))
     for block in range(40):
-        assert ring.claim() is not None
-        ring.commit(10 * block, 10)
+        put(ring, 10 * block, 10)
         ring.release()
     assert (ring.shape.history_slots, ring.history_line, ring.statistics().history) == (12, 280, 12)
     assert ring.released_line == 400
@@ -262,9 +264,8 @@ def test_history_is_taken_back_from_the_line_that_is_asked_for() -> None:
     assert ring.history_line == 280
     assert (ring.lease(395), ring.fill) == ([], 12)  # what was taken back stays
     for block in range(40, 44):  # the reserve
-        assert ring.claim() is not None
-        ring.commit(10 * block, 10)
-    assert ring.claim() is None
+        put(ring, 10 * block, 10)
+    assert ring.claim(440, 10) is None
     assert ring.released_line == 280  # though what was released last has been overwritten
     del taken
     ring.close()
@@ -277,9 +278,10 @@ def test_impossible_shapes_and_losses_are_refused(ring: Ring) -> None:
         RingShape(4, 1, 1, "uint8", reserve=1)
     with pytest.raises(UsageError, match="observer 0"):
         Observer(ring, 0)
-    ring.claim()
+    slot = ring.claim(0, 1)
+    assert slot is not None
     with pytest.raises(UsageError, match="losses"):
-        ring.commit(0, 1, [Loss(0, 1, Cause.CAMERA)] * (MAX_LOSSES + 1))
+        ring.commit(slot, [Loss(0, 1, Cause.CAMERA)] * (MAX_LOSSES + 1))
 
 
 BIG = RingShape(slots=8, rows=256, width=64, dtype="uint16", observers=1)
@@ -290,14 +292,14 @@ def produce_for_ever(ring: Ring) -> None:
     """As fast as it can, from where the last one stopped."""
     line = ring.newest_line
     while True:
-        slot = ring.claim()
+        slot = ring.claim(line, BIG.rows)
         if slot is None:
             ring.drop(line, BIG.rows)
             time.sleep(0.0005)
         else:
             slot.pixels[:] = pattern(line, BIG.rows, BIG.width)
             slot.flags[:] = line % 1000
-            ring.commit(line, BIG.rows)
+            ring.commit(slot)
         line += BIG.rows
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -41,15 +41,12 @@ class MemoryWriter:
     nearly_full: str | None = None
     packs: bool = False
 
-    def append(self, block: TaggedBlock) -> None:
+    def append(self, block: TaggedBlock, *, lent: bool = False) -> None:
         self._refuse("append")
         taken = self.blocks[block.arm]
         assert not taken or taken[-1].end_line == block.first_line, "rows must follow one another"
-        pixels = block.pixels.copy()  # the ring takes its memory back
-        taken.append(TaggedBlock(block.arm, block.first_line, pixels, *rest_of(block)))
-
-    def lend(self, block: TaggedBlock) -> None:
-        self.append(block)
+        # The ring takes its memory back.
+        taken.append(replace(block, pixels=block.pixels.copy(), flags=block.flags.copy()))
 
     def give_back(self, arm: str) -> None:
         self._refuse("give_back")
@@ -79,10 +76,6 @@ class MemoryWriter:
     def _refuse(self, name: str) -> None:
         if name in self.broken:
             raise DataError(f"{name}: no space left", possible="0 lines can be read", hint="free space")
-
-
-def rest_of(block: TaggedBlock) -> tuple[np.ndarray, ...]:
-    return block.flags.copy(), block.code_index, block.code, block.tick, block.time_ns
 
 
 def value_of(arm: str, line: int) -> int:
@@ -145,7 +138,8 @@ def test_every_line_has_its_row_and_every_loss_its_cause(
         for row, line in enumerate(range(first_line, first_line + lines)):
             assert (pixels[row] == (0 if line in missing else value_of(arm, line))).all()
             assert flags[row] == (LineFlag.MISSING if line in missing else 0)
-        assert np.array_equal(writer.column(arm, "code_index"), 3 * np.arange(first_line, first_line + lines))
+        code_index = np.concatenate([block.tags.code_index for block in writer.blocks[arm]])
+        assert np.array_equal(code_index, 3 * np.arange(first_line, first_line + lines))
         listed = {
             line: cause
             for gap_arm, first, count, cause in writer.gaps

@@ -83,8 +83,10 @@ def test_what_waits_in_the_ring_is_life(arms: dict[str, Arm]) -> None:
     now_s = arm.alive_s
     arm.watch(now_s + 1)
     assert arm.alive_s == now_s
-    arm.ring.claim()
-    arm.ring.commit(0, 16)
+    slot = arm.ring.claim(0, 16)
+    assert slot is not None
+    arm.ring.commit(slot)
+    del slot
     for later in (2, 3):
         arm.watch(now_s + later)
         assert arm.alive_s == now_s + later

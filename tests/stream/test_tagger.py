@@ -23,7 +23,7 @@ def make_tagger(substeps: int = 3, ticks: int = 900) -> Tagger:
 
 
 def make_block(first_line: int, count: int) -> LineBlock:
-    return LineBlock("a", first_line, np.ones((count, 4), np.uint8), np.zeros(count, np.uint16))
+    return LineBlock(first_line, np.ones((count, 4), np.uint8), np.zeros(count, np.uint16))
 
 
 def right_tag(line: int, substeps: int = 3, ticks: int = 900) -> LineTag:
@@ -37,17 +37,18 @@ def right_tag(line: int, substeps: int = 3, ticks: int = 900) -> LineTag:
     ticks=st.integers(5, 5000),
 )
 def test_every_line_has_its_code_and_time(first: int, count: int, substeps: int, ticks: int) -> None:
-    tagged = make_tagger(substeps, ticks).tag(make_block(first, count))
+    tagged = make_tagger(substeps, ticks).tag("a", make_block(first, count))
+    tags = tagged.tags
     assert (tagged.first_line, tagged.end_line, len(tagged)) == (first, first + count, count)
     for k in {0, count // 2, count - 1}:
         line = first + k
         bits = CODE.bits(line * substeps, substeps)
         tick = (line * substeps + STAGES * substeps - 1) * ticks
-        assert int(tagged.code_index[k]) == line * substeps
-        assert int(tagged.code[k]) == sum(int(bit) << u for u, bit in enumerate(bits))
-        assert int(tagged.tick[k]) == tick
-        assert int(tagged.time_ns[k]) == CLOCK.utc_ns_at_tick_0 + tick * 10**9 // CLOCK.clock_hz
-    types = [a.dtype for a in (tagged.code_index, tagged.code, tagged.tick, tagged.time_ns, tagged.flags)]
+        assert int(tags.code_index[k]) == line * substeps
+        assert int(tags.code[k]) == sum(int(bit) << u for u, bit in enumerate(bits))
+        assert int(tags.tick[k]) == tick
+        assert int(tags.time_ns[k]) == CLOCK.utc_ns_at_tick_0 + tick * 10**9 // CLOCK.clock_hz
+    types = [a.dtype for a in (tags.code_index, tags.code, tags.tick, tags.time_ns, tagged.flags)]
     assert types == [np.uint64, np.uint8, np.uint64, np.int64, np.uint16]
 
 
@@ -67,7 +68,7 @@ def test_lines_beyond_the_last_tag_are_flagged_and_the_camera_s_flags_stay_untou
     assert tagger.confirmed_end == 257
     block = make_block(250, 20)
     block.flags[:] = LineFlag.SATURATED
-    flags = tagger.tag(block).flags
+    flags = tagger.tag("a", block).flags
     unconfirmed = LineFlag.TIME_ESTIMATED | LineFlag.CODE_UNVERIFIED
     assert (flags[:7] == LineFlag.SATURATED).all()
     assert (flags[7:] == LineFlag.SATURATED | unconfirmed).all()

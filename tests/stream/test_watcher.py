@@ -51,11 +51,11 @@ class Bed:
 
     def put(self, arm: str, at: int, damaged: bool = False) -> None:
         ring = self.rings[arm]
-        slot = ring.claim()
+        slot = ring.claim(1000 + self.next, ROWS)
         assert slot is not None
         slot.pixels[:] = 4095 if damaged else self.lines[arm][at : at + ROWS]
         slot.flags[:] = LineFlag.INCOMPLETE if damaged else 0
-        ring.commit(1000 + self.next, ROWS)
+        ring.commit(slot)
         ring.acquire()
         ring.release()
 

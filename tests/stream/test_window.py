@@ -36,8 +36,9 @@ def make_ring() -> Iterator[Callable[..., Ring]]:
         losses = [Loss(10 * lost.start, 10 * len(lost), Cause.CAMERA)] if lost else []
         for block in range(blocks):
             if block not in lost:
-                assert ring.claim() is not None
-                ring.commit(10 * block, 10, losses if block == lost.stop else ())
+                slot = ring.claim(10 * block, 10)
+                assert slot is not None
+                ring.commit(slot, losses if block == lost.stop else ())
                 ring.release()
         return ring
 

@@ -48,7 +48,7 @@ def test_damaged_and_missing_lines_are_shown_as_lost_and_told(tmp_path: Path) ->
     pixels[flags != 0] = WHITE  # what an earlier frame left behind
     with RecordingWriter.create(tmp_path / "run.zarr", spec) as writer:
         for arm in ARMS:
-            writer.append(tagger.tag(LineBlock(arm, 0, pixels, flags)))
+            writer.append(tagger.tag(arm, LineBlock(0, pixels, flags)))
         writer.seal(RunCondition.TAINTED, "stopped", {"tainted_by": {"incomplete_b": 7, "tag_mismatches": 2}})
     opened = open_recording(tmp_path / "run.zarr")
     for arm in ARMS:

@@ -46,11 +46,11 @@ def rings(recording: Recording) -> Iterator[dict[str, Ring]]:
             if ring.fill == 8:
                 ring.acquire()
                 ring.release()
-            slot = ring.claim()
+            slot = ring.claim(recording.first_line + start, BLOCK)
             assert slot is not None
             slot.pixels[:] = pixels[start : start + BLOCK]
             slot.flags[:] = 0
-            ring.commit(recording.first_line + start, BLOCK)
+            ring.commit(slot)
             del slot  # a view keeps the memory
     yield made
     for ring in made.values():
@@ -99,6 +99,8 @@ def test_lines_that_are_gone_or_missing_are_not_made_up(rings: dict[str, Ring], 
         assert peek.stretch(first + 490, 20) is None  # still to come
         ring.acquire()
         ring.release()
-        assert ring.claim() is not None
-        ring.commit(first + 700, BLOCK)  # lines were lost before it
+        slot = ring.claim(first + 700, BLOCK)  # lines were lost before it
+        assert slot is not None
+        ring.commit(slot)
+        del slot
         assert peek.stretch(first + 490, 220) is None

@@ -25,9 +25,9 @@ class Ours:
         self._due_s = 0.0
 
     def append(self, arm: str, block: np.ndarray) -> None:
-        line = LineBlock(arm, self._writer.next_line(arm), block, self._flags)
+        line = LineBlock(self._writer.next_line(arm), block, self._flags)
         self._writer.give_back(arm)  # as the recorder does in a hurry: the arms take turns
-        self._writer.lend(self._tagger.tag(line))
+        self._writer.append(self._tagger.tag(arm, line), lent=True)
         if time.monotonic() > self._due_s:
             self._writer.commit()
             self._due_s = time.monotonic() + COMMIT_S
