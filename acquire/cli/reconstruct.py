@@ -101,21 +101,24 @@ def reconstruct(
     ends: Annotated[
         str | None,
         typer.Option(
+            metavar="trusted|whole",
             help="Frames at the ends of the video: trusted (only those), or whole (also frames that are "
-            "sampled only in part). Default: trusted, or what the plan says."
+            "sampled only in part). Default: trusted, or what the plan says.",
         ),
     ] = None,
     preset: Annotated[
         str | None,
         typer.Option(
+            metavar="PRESET",
             help="Effort: fast, balanced or best. Default: balanced, or with --budget the preset that "
-            "`acquire tradeoff` found best."
+            "`acquire tradeoff` found best.",
         ),
     ] = None,
     solver: Annotated[
         str,
         typer.Option(
-            help="Solver: admm, twist (the paper's), twist-band, or another one listed by `acquire plugins`."
+            metavar="SOLVER",
+            help="Solver: admm, twist (the paper's), twist-band, or another one listed by `acquire plugins`.",
         ),
     ] = "admm",
     settings: Annotated[
@@ -140,9 +143,11 @@ def reconstruct(
         int | None, typer.Option(help="Number of iterations. Default: set by the preset.")
     ] = None,
     dtype: Annotated[
-        str, typer.Option(help="Floating-point type of the computation: float32 or float64.")
+        str, typer.Option(metavar="TYPE", help="Floating-point type of the computation: float32 or float64.")
     ] = "float32",
-    device: Annotated[str, typer.Option(help="Processor: cpu, or gpu (CUDA through CuPy).")] = "cpu",
+    device: Annotated[
+        str, typer.Option(metavar="cpu|gpu", help="Processor: cpu, or gpu (CUDA through CuPy).")
+    ] = "cpu",
     calibration: Annotated[
         str | None,
         typer.Option(
@@ -168,8 +173,9 @@ def reconstruct(
     search: Annotated[
         str | None,
         typer.Option(
+            metavar="each|shared",
             help="Search for prior and weight: in each tile or sub-segment (each), or once for all (shared). "
-            "Default: shared for tiles, each for sub-segments."
+            "Default: shared for tiles, each for sub-segments.",
         ),
     ] = None,
     preview: Annotated[

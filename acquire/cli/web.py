@@ -33,7 +33,8 @@ def web(
         Path | None, typer.Option("--socket", envvar="ACQUIRE_SOCKET", help="Control socket of the daemon.")
     ] = None,
     host: Annotated[
-        str | None, typer.Option(help="Address to listen on. Default: web.host of the rig file.")
+        str | None,
+        typer.Option(metavar="HOST", help="Address to listen on. Default: web.host of the rig file."),
     ] = None,
     port: Annotated[
         int | None, typer.Option(help="Port to listen on. Default: web.port of the rig file.")
