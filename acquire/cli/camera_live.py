@@ -5,12 +5,12 @@ from __future__ import annotations
 import sys
 import time
 from dataclasses import asdict
-from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from acquire.cli.completion import rigs
+from acquire.cli.control import SocketOption
 from acquire.cli.durations import seconds_between
 from acquire.cli.output import JsonFlag, json_text, say
 from acquire.daemon.options import LightCode
@@ -56,9 +56,7 @@ def live(
             help="End after this time. Default: at Ctrl-C.",
         ),
     ] = None,
-    socket: Annotated[
-        Path | None, typer.Option("--socket", envvar="ACQUIRE_SOCKET", help="Control socket of the daemon.")
-    ] = None,
+    socket: SocketOption = None,
     json: JsonFlag = False,
 ) -> None:
     """Show level, saturation and focus of the cameras five times a second, until Ctrl-C.
