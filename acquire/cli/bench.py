@@ -45,7 +45,8 @@ def bench(
         ),
     ] = None,
     out: Annotated[
-        Path | None, typer.Option(help="Directory to record in. Default: the one in the rig file.")
+        Path | None,
+        typer.Option(metavar="DIR", help="Directory to record in. Default: the one in the rig file."),
     ] = None,
     seconds: Annotated[
         float,

@@ -19,7 +19,8 @@ if TYPE_CHECKING:
     from acquire.calibrate.calibration import Calibration, Finding
     from acquire.calibrate.exposure import Exposure
     from acquire.client import Client
-    from acquire.daemon.messages import LightCode, Status, TriggerDelays, TriggerWindow
+    from acquire.daemon.messages import Status, TriggerDelays, TriggerWindow
+    from acquire.daemon.options import LightCode
 
 SEALED_S = 120.0
 """Longest wait for a recording to be sealed, in addition to the duration of its lines."""

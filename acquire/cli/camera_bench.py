@@ -11,7 +11,7 @@ from acquire.errors import TriggerError, UsageError
 if TYPE_CHECKING:
     from acquire.camera.base import CameraOpener
     from acquire.config import RigConfig
-    from acquire.daemon.messages import LightCode
+    from acquire.daemon.options import LightCode
     from acquire.rig import Rig
 
 OPEN_S = 60.0

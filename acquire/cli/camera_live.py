@@ -5,15 +5,15 @@ from __future__ import annotations
 import sys
 import time
 from dataclasses import asdict
-from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, get_args
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from acquire.cli.completion import rigs
+from acquire.cli.control import SocketOption
 from acquire.cli.durations import seconds_between
 from acquire.cli.output import JsonFlag, json_text, say
-from acquire.errors import UsageError
+from acquire.daemon.options import LightCode
 
 if TYPE_CHECKING:
     import threading
@@ -41,7 +41,7 @@ def live(
         ),
     ] = None,
     code: Annotated[
-        str | None,
+        LightCode | None,
         typer.Option(
             help="Light, with --config: rig (follow the rig's code), dark (off) or steady (on). Default: rig."
         ),
@@ -56,9 +56,7 @@ def live(
             help="End after this time. Default: at Ctrl-C.",
         ),
     ] = None,
-    socket: Annotated[
-        Path | None, typer.Option("--socket", envvar="ACQUIRE_SOCKET", help="Control socket of the daemon.")
-    ] = None,
+    socket: SocketOption = None,
     json: JsonFlag = False,
 ) -> None:
     """Show level, saturation and focus of the cameras five times a second, until Ctrl-C.
@@ -73,14 +71,11 @@ def live(
     from acquire.cli.camera_sources import open_source
     from acquire.cli.interrupts import stop_on_interrupt
     from acquire.client import Client
-    from acquire.daemon.messages import LightCode
 
-    if code is not None and code not in get_args(LightCode):
-        raise UsageError(f"there is no light {code!r} for --code", possible=", ".join(get_args(LightCode)))
     with (
         # Before the cameras are opened, which takes seconds: a Ctrl-C meanwhile closes them, too.
         stop_on_interrupt("closing the cameras") as stop_requested,
-        open_source(config, serial, code, Client(socket)) as source,  # type: ignore[arg-type]  # checked above
+        open_source(config, serial, code, Client(socket)) as source,
     ):
         readings = _readings(source, stop_requested, seconds)
         if sys.stdout.isatty() and not json:

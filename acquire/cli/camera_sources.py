@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
     from acquire.camera.gauge import Reading
     from acquire.client import Client
-    from acquire.daemon.messages import LightCode
+    from acquire.daemon.options import LightCode
 
 LATE_S = 1.0
 """A camera that delivers no readings for this time is shown as one without lines."""

@@ -18,6 +18,13 @@ _CHECKS = ("exists", "writable", "resolve_path", "allow_dash", "path_type", "cli
 """Properties of an option whose values typer must validate itself: a path that has to exist, for example."""
 
 
+def range_in_words(least: float | None, most: float | None) -> str:
+    """Return `1 to 9`, `1 or more` or `9 or less`; an empty text without limits."""
+    if least is None:
+        return "" if most is None else f"{most:g} or less"
+    return f"{least:g} or more" if most is None else f"{least:g} to {most:g}"
+
+
 class Quick:
     """Converts the values of one option; ``_slow`` builds typer's own validator."""
 
@@ -49,9 +56,7 @@ class Quick:
             raise typer.BadParameter(_NOT[self._type].format(repr(value)), ctx=ctx, param=param) from None
         least, most = self._least, self._most
         if not (least is None or found >= least) or not (most is None or found <= most):  # true for nan, too
-            possible = f"{most:g} or less" if least is None else f"{least:g} or more"
-            if least is not None and most is not None:
-                possible = f"{least:g} to {most:g}"
+            possible = range_in_words(least, most)
             raise typer.BadParameter(f"{found} is out of range: {possible}", ctx=ctx, param=param)
         return found
 

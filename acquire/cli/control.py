@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Unpack
 
 import typer
 
 from acquire.cli.completion import states
 from acquire.cli.durations import seconds
 from acquire.cli.output import JsonFlag, print_json, print_warning, say
+from acquire.cli.spelled import spelled
 from acquire.cli.status_page import show, show_document
 from acquire.daemon.glance import NO_ANSWER, status_document
+from acquire.daemon.options import ArmOptions, StartOptions
 from acquire.errors import DataError, UsageError
 from acquire.text import did_you_mean, shown
 
@@ -33,17 +35,9 @@ def register(app: typer.Typer) -> None:
         app.command(rich_help_panel="Capture")(command)
 
 
+@spelled
 def arm(
-    force: Annotated[
-        bool,
-        typer.Option(
-            "--force", help="Arm even if this host is too slow or the store for uploads denies access."
-        ),
-    ] = False,
-    code: Annotated[
-        str,
-        typer.Option(help="Light: rig (follow the rig's code), dark (stay off) or steady (stay on)."),
-    ] = "rig",
+    *,
     without_calibration: Annotated[
         bool,
         typer.Option(
@@ -53,6 +47,7 @@ def arm(
     ] = False,
     socket: SocketOption = None,
     json: JsonFlag = False,
+    **options: Unpack[ArmOptions],
 ) -> None:
     """Start the trigger and the cameras without recording.
 
@@ -64,14 +59,16 @@ def arm(
 
     Example: [bold]acquire arm[/]
     """
+    if without_calibration:
+        options["calibration"] = "none"
     with _daemon(socket) as daemon:
-        calibration = "none" if without_calibration else "rig"
-        status = daemon.arm(force=force, code=code, calibration=calibration)  # type: ignore[arg-type]  # checked by the daemon
+        status = daemon.arm(**options)
     show(status, json)
     if status.calibration is not None and not status.calibration.carried:
         print_warning(f"recordings carry no calibration: {status.calibration.text}")
 
 
+@spelled
 def start(
     path: Annotated[
         Path | None,
@@ -79,40 +76,10 @@ def start(
             metavar="RECORDING", help="New recording NAME.zarr. Default: a name made of the rig and the time."
         ),
     ] = None,
-    lines: Annotated[
-        int | None, typer.Option(help="End after this number of lines. Default: at `acquire stop`.")
-    ] = None,
-    duration: Annotated[
-        float | None,
-        typer.Option(
-            parser=seconds,
-            metavar="TIME",
-            help="End after this time, such as 5s, 500ms or 2min. Default: at `acquire stop`.",
-        ),
-    ] = None,
-    pre: Annotated[
-        float | None,
-        typer.Option(
-            parser=seconds,
-            metavar="TIME",
-            help="Begin this long before the command, with lines that are still in the ring buffers. "
-            "Default: with the next line.",
-        ),
-    ] = None,
-    post: Annotated[
-        float | None,
-        typer.Option(
-            parser=seconds,
-            metavar="TIME",
-            help="End this long after the command, regardless of --pre. Default: at `acquire stop`.",
-        ),
-    ] = None,
-    resume: Annotated[
-        bool,
-        typer.Option("--resume", help="Continue a sealed RECORDING in a new segment next to it."),
-    ] = False,
+    *,
     socket: SocketOption = None,
     json: JsonFlag = False,
+    **options: Unpack[StartOptions],
 ) -> None:
     """Start recording, from the next line or from a few seconds ago.
 
@@ -121,10 +88,7 @@ def start(
     Example: [bold]acquire start run.zarr --lines 100000[/], or [bold]acquire start --pre 2s --post 1s[/]
     """
     with _daemon(socket) as daemon:
-        status = daemon.start(
-            path, lines=lines, duration_s=duration, pre_s=pre or 0.0, post_s=post, resume=resume
-        )
-        show(status, json)
+        show(daemon.start(path, **options), json)
 
 
 def mark(

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from contextlib import suppress
 from dataclasses import asdict
-from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from acquire.cli.completion import rigs
+from acquire.cli.control import SocketOption
 from acquire.cli.output import JsonFlag, print_json, print_table, say
 from acquire.errors import AcquireError, DeviceError
 
@@ -37,9 +37,7 @@ def doctor(
             help="Rig file, to also check its devices and requirements. Default: check the host only.",
         ),
     ] = None,
-    socket: Annotated[
-        Path | None, typer.Option("--socket", envvar="ACQUIRE_SOCKET", help="Control socket of the daemon.")
-    ] = None,
+    socket: SocketOption = None,
     json: JsonFlag = False,
 ) -> None:
     """Check kernel limits, disk, memory, real-time rights, clock, devices, ports and versions.

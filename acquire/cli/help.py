@@ -6,8 +6,10 @@ import re
 import shutil
 import textwrap
 from itertools import groupby
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from acquire.cli.coercion import range_in_words
 from acquire.cli.commands import COMMANDS
 
 if TYPE_CHECKING:
@@ -25,6 +27,8 @@ OPTIONS = (
 WIDEST = 120
 """Longer lines are hard to read."""
 NAMES = max(len(command.name) for command in COMMANDS)
+VALUES = {int: "N", float: "NUMBER", Path: "PATH"}
+"""What help calls a value of each type. Not of texts, whose options each say what they take (`metavar`)."""
 _MARKUP = re.compile(r"\[(bold|/)\]")
 
 
@@ -66,5 +70,21 @@ def make_plain(command: Any) -> None:
     if command.help and not command.short_help:
         # Without a summary click takes the help's beginning, cut to a line of the list.
         command.short_help = command.help.partition("\n\n")[0].replace("\n", " ")
+    for parameter in command.params:
+        _name_value(parameter)
     for below in getattr(command, "commands", {}).values():
         make_plain(below)
+
+
+def _name_value(parameter: Any) -> None:
+    """Let help name a parameter's value in words; typer has `<int range>`, and `x>=0` for a range."""
+    about = getattr(parameter, "type_descriptor", None)
+    if about is None:  # of a version of typer without it, whose own names will do
+        return
+    if parameter.param_type_name == "argument":
+        # Its name is enough, such as RECORDING: typer would add the type.
+        parameter.display_type_rich = lambda ctx: None  # noqa: ARG005
+    elif parameter.metavar is None:
+        parameter.metavar = "|".join(about.choices) if about.is_choice else VALUES.get(about.annotation)
+    limits = about.parameter_info
+    parameter._get_number_range_help_str = lambda: range_in_words(limits.min, limits.max)

@@ -61,7 +61,8 @@ def import_lines(
     code: Annotated[
         str | None,
         typer.Option(
-            help="Exposure code: prbs:DEGREE:SEED, prbs:DEGREE:0xSTATE, bits:0x…, bits:FILE or constant:1."
+            metavar="CODE",
+            help="Exposure code: prbs:DEGREE:SEED, prbs:DEGREE:0xSTATE, bits:0x…, bits:FILE or constant:1.",
         ),
     ] = None,
     code_start: Annotated[
@@ -76,10 +77,14 @@ def import_lines(
         int | None, typer.Option(help="Number of lines of each arm. Default: all lines.")
     ] = None,
     arm: Annotated[
-        str | None, typer.Option(help="Arm whose lines a single file holds: a or b. Default: a.")
+        str | None,
+        typer.Option(metavar="a|b", help="Arm whose lines a single file holds: a or b. Default: a."),
     ] = None,
     dtype: Annotated[
-        str | None, typer.Option(help="Sample type of raw binary files: uint8, uint16, or >u2 (big-endian).")
+        str | None,
+        typer.Option(
+            metavar="TYPE", help="Sample type of raw binary files: uint8, uint16, or >u2 (big-endian)."
+        ),
     ] = None,
     pixels: Annotated[
         int | None, typer.Option(min=1, help="Number of pixels per line in raw binary files.")

@@ -29,7 +29,9 @@ def install_service(
     ] = False,
     account: Annotated[
         str | None,
-        typer.Option(help="Account under which the host's service runs. Default: the current user."),
+        typer.Option(
+            metavar="USER", help="Account under which the host's service runs. Default: the current user."
+        ),
     ] = None,
     install: Annotated[
         bool, typer.Option("--install", help="Write the files. Default: only print them.")

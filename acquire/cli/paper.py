@@ -35,8 +35,12 @@ def paper(
     out: Annotated[
         Path, typer.Option(metavar="DIR", help="New directory for the page and all its data.")
     ] = Path("acquire-paper"),
-    preset: Annotated[str, typer.Option(help="Effort: fast, balanced or best.")] = "balanced",
-    solver: Annotated[str, typer.Option(help="Solver: admm, or twist (the paper's).")] = "admm",
+    preset: Annotated[
+        str, typer.Option(metavar="PRESET", help="Effort: fast, balanced or best.")
+    ] = "balanced",
+    solver: Annotated[
+        str, typer.Option(metavar="SOLVER", help="Solver: admm, or twist (the paper's).")
+    ] = "admm",
     budget: Annotated[
         float | None,
         typer.Option(

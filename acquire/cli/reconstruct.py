@@ -22,8 +22,8 @@ from acquire.cli.tiles import TilesOption, tiles_of
 from acquire.errors import EXIT_INTERRUPTED, UsageError
 
 if TYPE_CHECKING:
+    from acquire.calibrate.choose import Chosen
     from acquire.cli.reconstruct_request import Arguments, Prepared
-    from acquire.fibre import Tile
     from acquire.reconstruct import Outcome
     from acquire.store import Recording
 
@@ -101,21 +101,24 @@ def reconstruct(
     ends: Annotated[
         str | None,
         typer.Option(
+            metavar="trusted|whole",
             help="Frames at the ends of the video: trusted (only those), or whole (also frames that are "
-            "sampled only in part). Default: trusted, or what the plan says."
+            "sampled only in part). Default: trusted, or what the plan says.",
         ),
     ] = None,
     preset: Annotated[
         str | None,
         typer.Option(
+            metavar="PRESET",
             help="Effort: fast, balanced or best. Default: balanced, or with --budget the preset that "
-            "`acquire tradeoff` found best."
+            "`acquire tradeoff` found best.",
         ),
     ] = None,
     solver: Annotated[
         str,
         typer.Option(
-            help="Solver: admm, twist (the paper's), twist-band, or another one listed by `acquire plugins`."
+            metavar="SOLVER",
+            help="Solver: admm, twist (the paper's), twist-band, or another one listed by `acquire plugins`.",
         ),
     ] = "admm",
     settings: Annotated[
@@ -140,9 +143,11 @@ def reconstruct(
         int | None, typer.Option(help="Number of iterations. Default: set by the preset.")
     ] = None,
     dtype: Annotated[
-        str, typer.Option(help="Floating-point type of the computation: float32 or float64.")
+        str, typer.Option(metavar="TYPE", help="Floating-point type of the computation: float32 or float64.")
     ] = "float32",
-    device: Annotated[str, typer.Option(help="Processor: cpu, or gpu (CUDA through CuPy).")] = "cpu",
+    device: Annotated[
+        str, typer.Option(metavar="cpu|gpu", help="Processor: cpu, or gpu (CUDA through CuPy).")
+    ] = "cpu",
     calibration: Annotated[
         str | None,
         typer.Option(
@@ -168,8 +173,9 @@ def reconstruct(
     search: Annotated[
         str | None,
         typer.Option(
+            metavar="each|shared",
             help="Search for prior and weight: in each tile or sub-segment (each), or once for all (shared). "
-            "Default: shared for tiles, each for sub-segments."
+            "Default: shared for tiles, each for sub-segments.",
         ),
     ] = None,
     preview: Annotated[
@@ -193,9 +199,7 @@ def reconstruct(
     """
     from acquire.arrays import open_arrays
     from acquire.calibrate.choose import choose
-    from acquire.cli.reconstruct_explain import explain_calibration
-    from acquire.cli.reconstruct_report import print_outcomes, print_prepared
-    from acquire.cli.reconstruct_request import Arguments, check_arguments, prepare, suffixes
+    from acquire.cli.reconstruct_request import Arguments, check_arguments
     from acquire.config import parse_settings
     from acquire.recon.denoisers import open_denoiser
     from acquire.recon.solver import open_solver
@@ -213,7 +217,6 @@ def reconstruct(
         open_denoiser(denoiser)
     open_arrays(device if dask is None else "cpu", dtype)  # the devices of a cluster are not on this machine
     opened = open_recording(recording)
-    chosen_tiles = _tiles(opened, tiles, turned=try_orientations)
     chosen = choose(opened, calibration)
     arguments = Arguments(
         first_line=first_line,
@@ -240,29 +243,47 @@ def reconstruct(
             denoiser=denoiser,
             shared=SEARCHES[search],
         ),
-        tiles=chosen_tiles,
+        tiles=tiles_of(opened, tiles),
+        out=out,
+        explain=explain,
+        try_orientations=try_orientations,
+        workers=workers,
+        dask=dask,
     )
-    check_arguments(arguments, explain=explain)
+    check_arguments(arguments)
+    _carry_out(opened, chosen, arguments, began, json=json)
+
+
+def _carry_out(
+    recording: Recording, chosen: Chosen | None, arguments: Arguments, began: float, *, json: bool
+) -> None:
+    """Explain, plan and make what the arguments ask for, and print it; ``began`` starts the time limit."""
+    from acquire.cli.reconstruct_explain import explain_calibration
+    from acquire.cli.reconstruct_report import print_outcomes, print_prepared
+    from acquire.cli.reconstruct_request import prepare, suffixes
+
+    out = arguments.out
     # A place that is taken is refused before minutes of computing.
     places = [] if out is None else _new_places(out, suffixes(arguments))
     for doubt in () if chosen is None else chosen.doubts:
         print_warning(doubt)
-    explained = explain_calibration(opened, chosen, arguments, json=json) if explain else {}
-    if explain and not (out or auto):
+    explained = explain_calibration(recording, chosen, arguments, json=json) if arguments.explain else {}
+    if arguments.explain and not (out or arguments.auto):
         if json:
             print_json(explained)
         return
-    prepared = prepare(opened, _with_orientation(opened, arguments) if try_orientations else arguments)
+    if arguments.try_orientations:
+        arguments = _with_orientation(recording, arguments)
+    prepared = prepare(recording, arguments)
     if not json:
         print_prepared(prepared)
     if out is None:
         if json and prepared.plan is not None:
             print_json({**explained, "plan": prepared.plan.model_dump(mode="json", exclude_none=True)})
         return
-    if workers is None and (preview or (budget is not None and budget < PROCESSES_FROM * _age_s())):
-        workers = 1  # starting processes would take at least as long as starting this one did
-    outcomes = _make(opened, prepared, places, (workers, dask), began)
-    print_outcomes(outcomes, json=json, preview=preview, more={"explained": explained} if explained else {})
+    outcomes = _make(recording, prepared, places, arguments, began)
+    more = {"explained": explained} if explained else {}
+    print_outcomes(outcomes, json=json, preview=arguments.preview, more=more)
     if outcomes[-1].interrupted:
         raise typer.Exit(EXIT_INTERRUPTED)
 
@@ -324,15 +345,17 @@ def _make(
     recording: Recording,
     prepared: Prepared,
     places: list[str],
-    where: tuple[int | None, str | None],
+    arguments: Arguments,
     began: float,
 ) -> list[Outcome]:
-    """Make the videos one after the other, until the first that is interrupted.
-
-    ``where`` is a number of processes and a cluster; ``began`` starts the time limit.
-    """
+    """Make the videos one after the other, until the first that is interrupted."""
     from acquire.reconstruct import Watcher, combine, open_pool
 
+    workers, budget_s = arguments.workers, prepared.options.budget_s
+    hurried = budget_s is not None and budget_s < PROCESSES_FROM * _age_s()
+    # One process fills a GPU; starting several would take at least as long as starting this one did.
+    if workers is None and (arguments.preview or hurried or prepared.options.device != "cpu"):
+        workers = 1
     outcomes: list[Outcome] = []
     for place, request in zip(places, prepared.requests.values(), strict=True):
         options = prepared.options
@@ -343,9 +366,7 @@ def _make(
             share_s = (options.budget_s - elapsed_s) / (len(places) - len(outcomes))
             # More than 0, as a budget has to be, even if the videos before have taken all of it.
             options = replace(options, budget_s=max(elapsed_s + share_s, LEAST_S))
-        tasks, (workers, cluster) = len(request.stretches) * max(1, len(request.tiles)), where
-        if workers is None and options.device != "cpu":
-            workers = 1  # one process fills a GPU
+        tasks = len(request.stretches) * max(1, len(request.tiles))
         name = f"reconstructing {PurePosixPath(place).name}"
         with (
             stop_on_interrupt("finishing the current sub-segments with their results so far") as stopped,
@@ -353,26 +374,13 @@ def _make(
             stage_progress(name, QUICKER if options.budget_s is None else "") as advance,
         ):
             watcher = Watcher(tasks, advance, stopped.is_set)
-            with open_pool(tasks, workers, cluster, watcher) as pool:
+            with open_pool(tasks, workers, arguments.dask, watcher) as pool:
                 outcome = combine(recording, request, place, options, pool, watcher, began)
         outcomes.append(outcome)
         # Ctrl-C is meant for the whole command.
         if outcome.interrupted:
             break
     return outcomes
-
-
-def _tiles(recording: Recording, text: str | None, *, turned: bool) -> tuple[Tile, ...]:
-    """Return the selected tiles. Raises UsageError if arms behind a fibre are to be ``turned``."""
-    tiles = tiles_of(recording, text)
-    if tiles and turned:
-        raise UsageError(
-            "--try-orientations cannot be used behind a fibre: if an arm is mirrored, a tile is seen by "
-            "other columns",
-            possible="`acquire diagnose --tile`, which checks the orientation; [fibre] in the rig file, "
-            "which places the fibre bands",
-        )
-    return tiles
 
 
 def _with_orientation(recording: Recording, arguments: Arguments) -> Arguments:

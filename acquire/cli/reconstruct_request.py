@@ -66,6 +66,11 @@ class Arguments:
     preset: str | None
     options: Options
     tiles: tuple[Tile, ...] = ()
+    out: str | None = None
+    explain: bool = False
+    try_orientations: bool = False
+    workers: int | None = None
+    dask: str | None = None
 
     @property
     def kinds(self) -> list[Voxels]:
@@ -111,13 +116,17 @@ def prepare(recording: Recording, arguments: Arguments) -> Prepared:
     return replace(prepared, options=options, learned=choice.why)
 
 
-def check_arguments(arguments: Arguments, *, explain: bool = False) -> None:
-    """Raise UsageError for arguments that contradict each other, and for a plan file that exists.
-
-    With ``explain``, voxel sizes have a use beside a plan.
-    """
+def check_arguments(arguments: Arguments) -> None:
+    """Raise UsageError for arguments that contradict each other, and for a plan file that exists."""
     if arguments.ends not in ENDS:
         raise UsageError(f"there is no --ends {arguments.ends}", possible="trusted, whole")
+    if arguments.try_orientations and arguments.tiles:
+        raise UsageError(
+            "--try-orientations cannot be used behind a fibre: if an arm is mirrored, a tile is seen by "
+            "other columns",
+            possible="`acquire diagnose --tile`, which checks the orientation; [fibre] in the rig file, "
+            "which places the fibre bands",
+        )
     ways = {
         "--plan": arguments.plan is not None,
         "--segment": bool(arguments.segments),
@@ -127,7 +136,8 @@ def check_arguments(arguments: Arguments, *, explain: bool = False) -> None:
     chosen = [name for name, given in ways.items() if given]
     if len(chosen) > 1:
         raise UsageError(f"{', '.join(ways)} exclude each other", possible="one of them")
-    if chosen and arguments.voxels and not explain:
+    # An explanation uses voxel sizes even beside a plan.
+    if chosen and arguments.voxels and not arguments.explain:
         raise UsageError(
             f"--voxels, --nm and --tm have no effect with {chosen[0]}, which has voxels of its own",
             possible=f"{chosen[0]}, or voxel sizes",

@@ -67,14 +67,19 @@ def tradeoff(
         typer.Option(metavar="NMxTM", help="Voxel size to try, N_m x T_m. Repeatable. Default: 3x1."),
     ] = None,
     solver: Annotated[
-        list[str] | None, typer.Option(help="Solver to try. Repeatable. Default: all solvers.")
+        list[str] | None,
+        typer.Option(metavar="SOLVER", help="Solver to try. Repeatable. Default: all solvers."),
     ] = None,
     preset: Annotated[
-        list[str] | None, typer.Option(help="Preset to try. Repeatable. Default: fast and balanced.")
+        list[str] | None,
+        typer.Option(metavar="PRESET", help="Preset to try. Repeatable. Default: fast and balanced."),
     ] = None,
     dtype: Annotated[
         list[str] | None,
-        typer.Option(help="Floating-point type to try, float32 or float64. Repeatable. Default: float32."),
+        typer.Option(
+            metavar="TYPE",
+            help="Floating-point type to try, float32 or float64. Repeatable. Default: float32.",
+        ),
     ] = None,
     repeats: Annotated[
         int, typer.Option(min=1, max=20, help="Number of runs of each kind, whose spread the curves show.")

@@ -105,7 +105,9 @@ def arm(
     config: ConfigOption = "rig-demo",
     url: UrlOption = None,
     settings: SetOption = None,
-    run_id: Annotated[str | None, typer.Option(help="Name of the run. Default: a new name.")] = None,
+    run_id: Annotated[
+        str | None, typer.Option(metavar="NAME", help="Name of the run. Default: a new name.")
+    ] = None,
     start: Annotated[bool, typer.Option("--start", help="Also start the run.")] = False,
     memory: Annotated[
         bool,

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from acquire.cli.completion import rigs
+from acquire.cli.control import SocketOption
 from acquire.cli.output import note, say
 
 if TYPE_CHECKING:
@@ -29,11 +30,10 @@ def web(
             help="Rig file with the [web] settings. Default: built-in settings.",
         ),
     ] = None,
-    socket: Annotated[
-        Path | None, typer.Option("--socket", envvar="ACQUIRE_SOCKET", help="Control socket of the daemon.")
-    ] = None,
+    socket: SocketOption = None,
     host: Annotated[
-        str | None, typer.Option(help="Address to listen on. Default: web.host of the rig file.")
+        str | None,
+        typer.Option(metavar="HOST", help="Address to listen on. Default: web.host of the rig file."),
     ] = None,
     port: Annotated[
         int | None, typer.Option(help="Port to listen on. Default: web.port of the rig file.")

@@ -6,7 +6,7 @@ import asyncio
 import contextlib
 import ssl
 import time
-from typing import TYPE_CHECKING, Literal, Self, TypeVar
+from typing import TYPE_CHECKING, Self, TypeVar, Unpack
 
 import h11
 from pydantic import BaseModel
@@ -14,7 +14,8 @@ from pydantic import BaseModel
 from acquire.client import core
 from acquire.client.core import Call, EventReader, Target
 from acquire.daemon.facts import Health, News, Reloaded, Rings, Setup, Version
-from acquire.daemon.messages import CapacityStatus, LightCode, Status, TriggerDelays, TriggerWindow
+from acquire.daemon.messages import ArmRequest, CapacityStatus, StartRequest, Status
+from acquire.daemon.options import ArmOptions, StartOptions
 from acquire.daemon.peer import connect
 from acquire.errors import NoDaemonError
 
@@ -48,51 +49,21 @@ class AsyncClient:
     async def __aexit__(self, *_: object) -> None:
         """Do nothing: each call closes its own connection."""
 
-    async def arm(
-        self,
-        *,
-        force: bool = False,
-        code: LightCode = "rig",
-        calibration: Literal["rig", "none"] = "rig",
-        delays: TriggerDelays | None = None,
-        window: TriggerWindow | None = None,
-        request_id: str | None = None,
-    ) -> Status:
+    @core.shows(ArmOptions, ArmRequest)
+    async def arm(self, *, request_id: str | None = None, **options: Unpack[ArmOptions]) -> Status:
         """Go from idle to armed; the light follows ``code``."""
-        return await self.call(
-            core.arm(
-                request_id,
-                force=force,
-                code=code,
-                calibration=calibration,
-                delays=delays,
-                window=window,
-            )
-        )
+        return await self.call(core.arm(request_id, **options))
 
+    @core.shows(StartOptions, StartRequest)
     async def start(
         self,
         path: Path | str | None = None,
         *,
-        lines: int | None = None,
-        duration_s: float | None = None,
-        pre_s: float = 0.0,
-        post_s: float | None = None,
-        resume: bool = False,
         request_id: str | None = None,
+        **options: Unpack[StartOptions],
     ) -> Status:
         """Go from armed to recording."""
-        return await self.call(
-            core.start(
-                path,
-                request_id,
-                lines=lines,
-                duration_s=duration_s,
-                pre_s=pre_s,
-                post_s=post_s,
-                resume=resume,
-            )
-        )
+        return await self.call(core.start(path, request_id, **options))
 
     async def mark(self, text: str = "", *, request_id: str | None = None) -> Status:
         """Mark the newest line with an event."""

@@ -8,14 +8,15 @@ import select
 import socket
 import ssl
 import time
-from typing import TYPE_CHECKING, Literal, Self, TypeVar
+from typing import TYPE_CHECKING, Self, TypeVar, Unpack
 
 from pydantic import BaseModel
 
 from acquire.client import core
 from acquire.client.core import Call, EventReader, Target
 from acquire.daemon.facts import Health, News, Reloaded, Rings, Setup, Version
-from acquire.daemon.messages import CapacityStatus, LightCode, Status, TriggerDelays, TriggerWindow
+from acquire.daemon.messages import ArmRequest, CapacityStatus, StartRequest, Status
+from acquire.daemon.options import ArmOptions, StartOptions
 from acquire.daemon.peer import connect
 from acquire.daemon.starting import is_one_starting
 from acquire.daemon.states import State
@@ -76,16 +77,8 @@ class Client:
 
     # ---- commands
 
-    def arm(
-        self,
-        *,
-        force: bool = False,
-        code: LightCode = "rig",
-        calibration: Literal["rig", "none"] = "rig",
-        delays: TriggerDelays | None = None,
-        window: TriggerWindow | None = None,
-        request_id: str | None = None,
-    ) -> Status:
+    @core.shows(ArmOptions, ArmRequest)
+    def arm(self, *, request_id: str | None = None, **options: Unpack[ArmOptions]) -> Status:
         """Go from idle to armed: cameras and trigger run, and nothing is written.
 
         ``force`` arms even if the host is too slow. ``code`` is what the light follows: the rig's code,
@@ -93,27 +86,15 @@ class Client:
         recordings get no copy of the rig's calibration. ``delays`` of light and cameras and the ``window`` of
         the light in each lit sub-step replace those of the rig.
         """
-        return self._do(
-            core.arm(
-                request_id,
-                force=force,
-                code=code,
-                calibration=calibration,
-                delays=delays,
-                window=window,
-            )
-        )
+        return self._do(core.arm(request_id, **options))
 
+    @core.shows(StartOptions, StartRequest)
     def start(
         self,
         path: Path | str | None = None,
         *,
-        lines: int | None = None,
-        duration_s: float | None = None,
-        pre_s: float = 0.0,
-        post_s: float | None = None,
-        resume: bool = False,
         request_id: str | None = None,
+        **options: Unpack[StartOptions],
     ) -> Status:
         """Go from armed to recording. A relative ``path`` is relative to the caller's directory.
 
@@ -121,17 +102,7 @@ class Client:
         ``post_s`` is the time from the request to its end. With ``resume``, ``path`` is a sealed recording
         that continues in a segment next to it.
         """
-        return self._do(
-            core.start(
-                path,
-                request_id,
-                lines=lines,
-                duration_s=duration_s,
-                pre_s=pre_s,
-                post_s=post_s,
-                resume=resume,
-            )
-        )
+        return self._do(core.start(path, request_id, **options))
 
     def mark(self, text: str = "", *, request_id: str | None = None) -> Status:
         """Mark the newest line with an event, which starts a recording if the rig's ``[events]`` allow it."""

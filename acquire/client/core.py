@@ -13,9 +13,11 @@ import json
 import os
 import re
 import secrets
+import sys
 from dataclasses import dataclass, field
+from inspect import Parameter, signature
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Generic, TypeVar
+from typing import TYPE_CHECKING, Any, Generic, ParamSpec, TypeVar, Unpack, get_type_hints
 from urllib.parse import urlencode, urlsplit
 
 from pydantic import BaseModel, ValidationError
@@ -29,14 +31,15 @@ from acquire.daemon.messages import (
     StartRequest,
     Status,
 )
+from acquire.daemon.options import ArmOptions, StartOptions, one_by_one
 from acquire.daemon.states import State
 from acquire.daemon.who import HEADER, WHO
 from acquire.errors import AcquireError, UsageError
 from acquire.place import default_socket
-from acquire.text import own_words, shortened, shown
+from acquire.text import did_you_mean, own_words, shortened, shown
 
 if TYPE_CHECKING:
-    from collections.abc import Collection, Iterator
+    from collections.abc import Callable, Collection, Iterator
 
 CONNECT_TIMEOUT_S = 5.0
 STATUS_TIMEOUT_S = 10.0
@@ -60,6 +63,8 @@ _TOKEN = re.compile(r"[ -~]+")
 
 T = TypeVar("T", bound=BaseModel)
 R = TypeVar("R", bound=BaseModel)
+P = ParamSpec("P")
+Answer = TypeVar("Answer")
 
 
 def _fits(pattern: re.Pattern[str], value: object) -> bool:
@@ -189,15 +194,31 @@ def command(
     return Call("POST", name, answer, body, request_id=request_id or secrets.token_hex(16))
 
 
-def arm(request_id: str | None, **how: Any) -> Call[Status]:
-    return command("arm", Status, request("arm", ArmRequest, **how), request_id)
+def shows(options: type, model: type[BaseModel]) -> Callable[[Callable[P, Answer]], Callable[P, Answer]]:
+    """Return a decorator that shows ``**options`` one by one, with defaults, to help() and completion."""
+    kinds = get_type_hints(options, localns=vars(sys.modules[model.__module__]))
+    each = [
+        Parameter(name, Parameter.KEYWORD_ONLY, default=model.model_fields[name].default, annotation=kind)
+        for name, kind in kinds.items()
+    ]
+
+    def decorate(method: Callable[P, Answer]) -> Callable[P, Answer]:
+        # Type checkers see through `Unpack`; whoever asks a running program sees only ``**options``.
+        method.__signature__ = one_by_one(signature(method), each)  # type: ignore[attr-defined]
+        return method
+
+    return decorate
 
 
-def start(path: Path | str | None, request_id: str | None, **budget: Any) -> Call[Status]:
+def arm(request_id: str | None, **options: Unpack[ArmOptions]) -> Call[Status]:
+    return command("arm", Status, request("arm", ArmRequest, **options), request_id)
+
+
+def start(path: Path | str | None, request_id: str | None, **options: Unpack[StartOptions]) -> Call[Status]:
     """Return the command; a relative ``path`` is relative to the caller's directory."""
     # The daemon has another working directory. Anything else than a path is refused by the model.
     absolute = Path(path).absolute() if isinstance(path, str | os.PathLike) else path
-    return command("start", Status, request("start", StartRequest, path=absolute, **budget), request_id)
+    return command("start", Status, request("start", StartRequest, path=absolute, **options), request_id)
 
 
 def mark(text: str, request_id: str | None) -> Call[Status]:
@@ -211,6 +232,12 @@ def request(command: str, model: type[R], **fields: Any) -> R:
     except ValidationError as error:
         first = error.errors()[0]
         where = ".".join(map(str, first["loc"]))
+        if first["type"] == "extra_forbidden":
+            known = model.model_fields
+            raise UsageError(
+                f"{command}: there is no option {where!r}{did_you_mean(where, known)}",
+                possible=", ".join(known),
+            ) from None
         # Fields that exclude each other have no place, and name themselves; what is missing has no value.
         value = "" if first["type"] == "missing" else f" = {shown(first['input'])}"
         words = own_words(first["msg"])

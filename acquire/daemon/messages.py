@@ -12,6 +12,7 @@ from typing import Annotated, Any, Literal
 from pydantic import BaseModel, ConfigDict, Field, PlainSerializer, field_validator, model_validator
 
 from acquire import errors
+from acquire.daemon.options import LightCode
 from acquire.daemon.states import State
 from acquire.errors import AcquireError, DeviceError, StateError, UsageError
 from acquire.text import visible
@@ -37,10 +38,6 @@ class Message(BaseModel):
     """Unknown keys are refused; values do not change."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
-
-
-LightCode = Literal["rig", "dark", "steady"]
-"""What the light follows in a run: the rig's code, or constantly off or on, for calibrations."""
 
 
 class TriggerDelays(Message):

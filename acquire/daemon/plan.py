@@ -25,7 +25,8 @@ if TYPE_CHECKING:
 
     from acquire.config import RigConfig
     from acquire.config.recording import RecordingConfig
-    from acquire.daemon.messages import ArmRequest, LightCode, StartRequest
+    from acquire.daemon.messages import ArmRequest, StartRequest
+    from acquire.daemon.options import LightCode
     from acquire.rig import Rig
     from acquire.store import CodecChoice
 

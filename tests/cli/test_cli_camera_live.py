@@ -65,7 +65,7 @@ def test_wrong_arguments(cli: Cli, tmp_path: Path, monkeypatch: pytest.MonkeyPat
     for command, code, text in (
         (nobody, 3, "--config RIG"),
         (("SIM-C", "-c", "rig-demo"), 2, "possible: SIM-A, SIM-B"),
-        (("-c", "rig-demo", "--code", "blue"), 2, "possible: rig, dark, steady"),
+        (("-c", "rig-demo", "--code", "blue"), 2, "is not one of 'rig', 'dark', 'steady'"),
         (("X", *nobody), 5, "GENICAM_GENTL64_PATH"),
     ):
         answer = cli("camera", "live", *command)

@@ -121,18 +121,21 @@ def test_status_as_json_is_the_message(cli: Cli, answering: Callable[[Status], F
     assert "camera a is gone" in cli("status").out
 
 
-def test_start_passes_on_all_its_options(cli: Cli, answering: Callable[[Status], FakeClient]) -> None:
+def test_commands_pass_on_the_options_that_were_given(
+    cli: Cli, answering: Callable[[Status], FakeClient]
+) -> None:
     client = answering(status(State.RECORDING))
     assert cli("start", "x.zarr", "--lines", 5).code == 0
     assert cli("start", "--duration", 0.5).code == 0
     assert cli("start", "--pre", "2s", "--post", "250ms").code == 0
     assert cli("mark", "a bang").code == 0
-    budget = {"lines": None, "duration_s": None, "pre_s": 0.0, "post_s": None, "resume": False}
+    assert cli("arm", "--code", "dark", "--without-calibration").code == 0
     assert client.calls == [
-        ("start", Path("x.zarr"), budget | {"lines": 5}),
-        ("start", None, budget | {"duration_s": 0.5}),
-        ("start", None, budget | {"pre_s": 2.0, "post_s": 0.25}),
+        ("start", Path("x.zarr"), {"lines": 5, "resume": False}),
+        ("start", None, {"duration_s": 0.5, "resume": False}),
+        ("start", None, {"pre_s": 2.0, "post_s": 0.25, "resume": False}),
         ("mark", "a bang", {}),
+        ("arm", {"force": False, "code": "dark", "calibration": "none"}),
     ]
 
 

@@ -87,6 +87,12 @@ def test_an_unrecognisable_word_gets_no_suggestion(cli: Cli) -> None:
     assert "did you mean" not in cli("xyzzy").err
 
 
+def test_help_names_what_an_option_takes_and_its_range(cli: Cli) -> None:
+    said = cli("demo", "--help").out
+    assert "--trigger simulated|rtl" in said
+    assert re.search(r"--seed N +Seed of the exposure code.  \[default: 1; 0 or\s+more\]", said)
+
+
 def test_help_names_the_environment_s_variables(cli: Cli) -> None:
     assert "[env var: ACQUIRE_SOCKET]" in cli("arm", "--help").out
 

@@ -68,6 +68,13 @@ def test_help_fits_a_narrow_terminal_and_cuts_no_name(
     assert example[: len(words) + 2] == ["Example:", "acquire", *words]
 
 
+@pytest.mark.parametrize("words", COMMANDS, ids=" ".join)
+def test_help_names_values_in_words_and_no_types(cli: Cli, words: tuple[str, ...]) -> None:
+    said = cli(*words, "--help").out
+    assert not re.search(r"<(int|float|str|path|file|dir|list|bool|uuid|datetime)\b|[<>]=", said.lower())
+    assert not re.search(r"^  (-., )?--[\w-]+ <", said, re.MULTILINE)
+
+
 @pytest.mark.parametrize(
     ("words", "command", "message"),
     [

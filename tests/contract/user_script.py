@@ -34,3 +34,9 @@ def take(name: str) -> str:
         client.arm()
         began = client.start(name, post_s=1.0)
         return began.state.value
+
+
+def misspelt_options(client: acquire.Client) -> None:
+    client.arm(code="bright")  # type: ignore[arg-type]  # unused if any value were accepted
+    client.start("run.zarr", duration=1.0)  # type: ignore[call-arg]  # unused if any keyword were accepted
+    client.start("run.zarr", duration_s="1s")  # type: ignore[arg-type]

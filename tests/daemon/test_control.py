@@ -68,6 +68,8 @@ def test_impossible_start_is_refused_before_it_is_sent(daemon: Client) -> None:
         daemon.start(lines=1, duration_s=1.0)
     with pytest.raises(UsageError, match="pre_s must be less than duration_s"):
         daemon.start(duration_s=1.0, pre_s=1.0)
+    with pytest.raises(UsageError, match="there is no option 'duration'; did you mean 'duration_s'"):
+        daemon.start(duration=1.0)  # type: ignore[call-arg]
 
 
 def test_malformed_request_names_the_key(path: Path, daemon: Client) -> None:
