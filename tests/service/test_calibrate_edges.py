@@ -1,4 +1,4 @@
-"""The optics' blur in the guided calibration: measured on request, and refused if it cannot be determined."""
+"""Blur and veil in the guided calibration: measured on request, and refused if they cannot be determined."""
 
 from __future__ import annotations
 
@@ -34,6 +34,9 @@ kind = "psf"
 sigma_pixels = 0.7
 sigma_b_pixels = 1.3
 [[effects]]
+kind = "stray_light"
+veil = 0.02
+[[effects]]
 kind = "prnu"
 prnu = 0.01
 [[effects]]
@@ -62,7 +65,7 @@ def put(home: Path, picture: np.ndarray) -> str:
     return f"simulation.scene='{home}/scene.toml'"
 
 
-def test_the_blur_is_measured_last_and_earlier_results_are_kept(tmp_path: Path) -> None:
+def test_blur_and_veil_are_measured_last_and_earlier_results_are_kept(tmp_path: Path) -> None:
     scene = put(tmp_path, np.full((N, N), 0.6, np.float32))
     cal = tmp_path / "cal.zarr"
     with contextlib.closing(Daemon(tmp_path, *SETTINGS, scene)) as daemon:
@@ -82,6 +85,13 @@ def test_the_blur_is_measured_last_and_earlier_results_are_kept(tmp_path: Path) 
         assert list(known.steps) == ["dark", "psf"]
         blur = known.quantities["blur_px"].value
         np.testing.assert_allclose(blur, [[0.7, 0.7], [1.3, 1.3]], atol=0.12)
+
+        black = daemon(*words, "--only", "veil", "--json")
+        assert black.code == 0, black.err
+        assert "veil: Put a target in, at rest, a few percent of which send no light at all" in black.err
+        veil = open_calibration(cal).quantities["veil"]
+        assert (np.abs(veil.value - 0.02) < 4 * veil.uncertainty).all()
+        assert "the lens's veil" in daemon("calibrate", "show", cal).out
         with daemon.client() as client:
             assert client.status().state == "idle"
 
@@ -113,6 +123,7 @@ def test_repeatedly_missing_lines_are_reported_with_the_ends_of_the_recordings(t
             ("--only", "psf"),
             "psf: the rig has a fibre",
         ),
+        (("code={kind='constant'}",), ("--veil",), "veil: the rig's code is constant"),
     ],
 )
 def test_an_unsuitable_rig_is_refused_before_anything_is_recorded(
@@ -122,7 +133,7 @@ def test_an_unsuitable_rig_is_refused_before_anything_is_recorded(
         refused = daemon("calibrate", "all", *asked, "--yes", "--out", tmp_path / "cal.zarr")
         assert refused.code == 2
         assert why in refused.err
-        assert "leave psf out" in refused.err
+        assert f"leave {why.partition(':')[0]} out" in refused.err
         assert not list((tmp_path / "calibration-recordings").iterdir())
 
 
