@@ -23,6 +23,7 @@ from acquire.daemon.control import build_app
 from acquire.daemon.ending import END_S, LastResort, leave
 from acquire.daemon.endpoint import Endpoint
 from acquire.daemon.hooks import Hooks
+from acquire.daemon.journal import journal_path, only_user
 from acquire.daemon.local import Local
 from acquire.daemon.messages import ArmRequest
 from acquire.daemon.notify import notify
@@ -42,7 +43,6 @@ from acquire.rig import Rig, check_rig
 
 if TYPE_CHECKING:
     from collections.abc import Callable
-    from pathlib import Path
 
     from acquire.config import RigConfig
 
@@ -64,18 +64,23 @@ T = TypeVar("T")
 def serve(config: RigConfig, origin: str = "", reread: Callable[[], RigConfig] | None = None) -> int:
     """Own the devices of ``config``, read from the file ``origin``, until a signal; return the exit code.
 
-    ``reread`` reads the configuration again. Raises StateError if another daemon has the socket, before any
-    device is touched.
+    ``reread`` reads the configuration again. Raises StateError if another daemon has the socket, or the lists
+    of this rig's recordings, before any device is touched.
     """
     raise_descriptor_limit()
     troubles = Troubles()
     threading.excepthook = troubles.in_thread
-    with contextlib.closing(Endpoint(config.control.socket.absolute())) as endpoint, Rig(config) as rig:
+    directory = config.recording.directory.absolute()
+    with (
+        contextlib.closing(Endpoint(config.control.socket.absolute())) as endpoint,
+        only_user(directory, config.name),
+        Rig(config) as rig,
+    ):
         # First: it imports modules while the rest begins, so that the first `arm` need not wait for it.
         warm_up(*worker_modules(rig))
-        salvage = Salvage(config.recording.directory.absolute(), _journal(config, "recordings"))
+        salvage = Salvage(directory, journal_path(directory, config.name, "recordings"))
         salvage.search()
-        uploads = Uploads(config.recording.upload_to, _journal(config, "uploads"))
+        uploads = Uploads(config.recording.upload_to, journal_path(directory, config.name, "uploads"))
         uploads.begin()
         proof = Proof(config)
 
@@ -110,11 +115,6 @@ def ends_with_terminal() -> bool:
     except OSError:
         return False
     return True
-
-
-def _journal(config: RigConfig, what: str) -> Path:
-    """Return the file that lists recordings that are not copied, or not sealed, yet."""
-    return config.recording.directory.absolute() / f".{what}-{config.name}.json"
 
 
 class Daemon:

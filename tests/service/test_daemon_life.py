@@ -194,6 +194,15 @@ def test_second_daemon_is_refused(daemon: Daemon) -> None:
         assert client.status().pid == daemon.process.pid
 
 
+def test_second_daemon_of_the_rig_is_refused_on_another_socket(daemon: Daemon) -> None:
+    """Both kept their lists of open recordings in one file, and each overwrote the other's."""
+    answer = acquire("serve", "--config", daemon.config, "--socket", daemon.home / "second.sock")
+    assert answer.code == 4
+    assert f"another daemon (process {daemon.process.pid}) of a rig named small records into" in answer.err
+    assert "--set name=NAME" in answer.err
+    assert not (daemon.home / "second.sock").exists()
+
+
 def test_socket_is_private(daemon: Daemon) -> None:
     assert stat.S_IMODE(daemon.socket.stat().st_mode) == 0o600
     assert daemon.socket.stat().st_uid == os.geteuid()
