@@ -19,7 +19,7 @@ from acquire.daemon.connections import Listener
 from acquire.daemon.peer import ELSEWHERE
 from acquire.errors import StateError, UsageError
 from acquire.place import default_socket
-from acquire.processes.lockfile import LockFile
+from acquire.processes.lockfile import LockFile, identity_of
 
 LONGEST_PATH = 107
 """Longest path of a Unix socket that the kernel accepts, in bytes."""
@@ -40,12 +40,7 @@ class Endpoint:
                 possible=f"a path of at most {LONGEST_PATH} bytes",
                 hint=ELSEWHERE,
             )
-        # The directory of any other path was chosen by the user, who may share it; clients look at it
-        # (`peer`).
-        if path == default_socket():
-            _own(path.parent)
-        if not path.parent.is_dir():
-            raise UsageError(f"control socket {path}: its directory does not exist", hint=ELSEWHERE)
+        _check_directory(path)
         if os.path.lexists(path) and not stat.S_ISSOCK(path.lstat().st_mode):
             raise UsageError(f"control socket {path}: something else is there, and is left untouched")
         self._closed = False
@@ -55,11 +50,36 @@ class Endpoint:
         except BaseException:
             self._lock.close()
             raise
+        self._identity = identity_of(path)
+
+    def renewed(self) -> Listener | None:
+        """Make lock and socket again if their names were removed; return a new socket, or None.
+
+        Raises as the construction does. What another program put in their place is left untouched.
+        """
+        if not self._lock.is_there:
+            _check_directory(self.path)
+            lock = _lock(self.path)
+            self._lock.close()
+            self._lock = lock
+        found = identity_of(self.path)
+        if found is not None and found == self._identity:
+            return None
+        if found is not None:
+            raise UsageError(
+                f"control socket {self.path}: something else is there now, and is left untouched",
+                hint=f"remove it, and the daemon (process {os.getpid()}) is reachable again",
+            )
+        self.socket = _listen(self.path)
+        self._identity = identity_of(self.path)
+        return self.socket
 
     def remove(self) -> None:
         """Remove the socket's name. May be called from any thread; the lock ends with the process."""
-        with contextlib.suppress(OSError):
-            self.path.unlink(missing_ok=True)
+        # Something else may have taken its place.
+        if identity_of(self.path) == self._identity:
+            with contextlib.suppress(OSError):
+                self.path.unlink(missing_ok=True)
 
     def close(self) -> None:
         """Remove the socket and let the next daemon in. Idempotent."""
@@ -74,6 +94,15 @@ class Endpoint:
 
 def lock_path(path: Path) -> Path:
     return path.with_name(path.name + ".lock")
+
+
+def _check_directory(path: Path) -> None:
+    # The directory of any other path was chosen by the user, who may share it; clients look at it
+    # (`peer`).
+    if path == default_socket():
+        _own(path.parent)
+    if not path.parent.is_dir():
+        raise UsageError(f"control socket {path}: its directory does not exist", hint=ELSEWHERE)
 
 
 def _own(directory: Path) -> None:

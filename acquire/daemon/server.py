@@ -30,6 +30,7 @@ from acquire.daemon.notify import notify
 from acquire.daemon.page import Page
 from acquire.daemon.plan import Run, armed_as, worker_modules
 from acquire.daemon.proof import Proof
+from acquire.daemon.reachable import stay_reachable
 from acquire.daemon.reload import Reloading
 from acquire.daemon.salvage import Salvage
 from acquire.daemon.service import Service
@@ -159,10 +160,14 @@ class Daemon:
             notify("READY=1")
         watchdog = asyncio.create_task(self._feed_watchdog())
         beginning = asyncio.create_task(begin(self._service.config.service, self._service, self._command))
+        reachable = asyncio.create_task(
+            stay_reachable(self._endpoint, self._server, self._service.news, self._troubles)
+        )
         try:
             await self._supervise(serving)
         finally:
             beginning.cancel()
+            reachable.cancel()
             await self._end(serving)
             watchdog.cancel()
             self._last_resort.cancel()
