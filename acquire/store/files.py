@@ -328,6 +328,24 @@ def lock(path: Path, doing: str, *, surely: bool = False) -> int:
     return fd
 
 
+def is_locked(path: Path) -> bool | None:
+    """Return whether a process has the directory ``path`` locked; None if that cannot be known."""
+    # A shared lock: two that only look do not meet each other.
+    try:
+        fd = os.open(path, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC | os.O_NOFOLLOW)
+    except OSError:
+        return None
+    try:
+        fcntl.flock(fd, fcntl.LOCK_SH | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return True
+    except OSError:
+        return None
+    finally:
+        os.close(fd)
+    return False
+
+
 def _walk(path: Path) -> Iterator[tuple[Path, list[Path]]]:
     # From the bottom up: `sync_tree` forces bytes before the names that lead to them.
     for directory, _, names in os.walk(path, topdown=False):
