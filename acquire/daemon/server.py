@@ -38,7 +38,7 @@ from acquire.daemon.states import State
 from acquire.daemon.troubles import Troubles
 from acquire.daemon.uploads import Uploads
 from acquire.daemon.who import WHO
-from acquire.errors import EXIT_INTERRUPTED, AcquireError, StateError
+from acquire.errors import EXIT_INTERRUPTED, AcquireError, BusyError, StateError
 from acquire.processes.nursery import nursery, warm_up
 from acquire.rig import Rig, check_rig
 
@@ -228,7 +228,7 @@ class Daemon:
             raise StateError("the daemon is ending", possible="status")
         # One more than may wait, since one of them is being carried out.
         if self._waiting > MOST_WAITING:
-            raise StateError(f"{MOST_WAITING} commands are waiting already", possible="status")
+            raise BusyError(f"{MOST_WAITING} commands are waiting already", possible="status")
         self._waiting += 1
         try:
             await self._in_device_thread(work)

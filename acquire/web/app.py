@@ -17,7 +17,7 @@ from acquire.daemon.answers import Answers
 from acquire.daemon.control import new_app
 from acquire.daemon.messages import ErrorMessage
 from acquire.daemon.routes import NO_STORE, RequestId, routes
-from acquire.errors import UsageError
+from acquire.errors import BusyError, UsageError
 from acquire.web.archive import Archive
 from acquire.web.calibrations import calibration_facts, place_of
 from acquire.web.guard import Guard
@@ -79,12 +79,17 @@ class Reading:
 
     async def __call__(self, work: Callable[[], T]) -> T:
         if self._waiting >= MOST_READING:
-            raise UsageError("too many requests are reading recordings already", hint="again in a moment")
+            raise BusyError(
+                f"{MOST_READING} requests are reading recordings already", hint="again in a moment"
+            )
         self._waiting += 1
         try:
             return await asyncio.get_running_loop().run_in_executor(self._thread, work)
         finally:
             self._waiting -= 1
+
+    def close(self) -> None:
+        self._thread.shutdown(wait=False, cancel_futures=True)
 
 
 def build_page(
@@ -108,6 +113,7 @@ def build_page(
                 task.cancel()
             # They must finish: a running job ends its process when it is cancelled.
             await asyncio.gather(*tasks, return_exceptions=True)
+            reading.close()
 
     app = new_app(
         "The instrument's page: the daemon's API, recordings, videos and jobs.",
