@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, Self, cast
 
 from acquire.errors import AcquireError, ConfigError, TriggerError, UsageError
 from acquire.lines import ARMS
+from acquire.plugins import CAMERAS, TRIGGERS, of_others
 
 if TYPE_CHECKING:
     from types import TracebackType
@@ -69,7 +70,12 @@ class Rig:
 
     def describe(self) -> dict[str, Any]:
         """Return what a recording must state about the origin of its lines (JSON)."""
-        return {"simulated": False} if self._simulated is None else self._simulated.describe()
+        origin = {"simulated": False} if self._simulated is None else self._simulated.describe()
+        config = self.config
+        drivers = [(TRIGGERS, config.trigger.driver)]
+        if config.simulation.replay is None:  # otherwise no camera is opened
+            drivers = [*((CAMERAS, config.cameras.arm(arm).driver) for arm in ARMS), *drivers]
+        return {**origin, "plugins": [*of_others(drivers), *origin.get("plugins", ())]}
 
     @property
     def layout(self) -> str:

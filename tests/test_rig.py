@@ -92,7 +92,7 @@ def test_the_description_in_a_recording_rebuilds_the_scene(config):
 
 def test_a_rig_of_real_cameras_is_not_called_simulated():
     with Rig(load_rig("rig-vt-4k5c-h100")) as rig:
-        assert rig.describe() == {"simulated": False}
+        assert rig.describe() == {"simulated": False, "plugins": []}
         assert rig.layout == "dual"
 
 
@@ -113,7 +113,7 @@ def test_real_devices_need_no_scene_and_nothing_that_makes_one(tmp_path):
         [sys.executable, "-c", code], capture_output=True, text=True, timeout=300, check=True
     )
     facts, modules = done.stdout.splitlines()
-    assert facts == "['a', 'b'] {'simulated': False} dual"
+    assert facts == "['a', 'b'] {'simulated': False, 'plugins': []} dual"
     scenes = {
         f"acquire.sim.{name}" for name in ("scenes", "scene", "pipeline", "lines", "effects", "instrument")
     }
@@ -147,7 +147,7 @@ def test_simulated_cameras_without_a_scene_are_refused_with_a_list_of_scenes(tmp
 def test_stored_lines_are_shown_without_a_scene(tmp_path):
     (tmp_path / "rig.toml").write_text(without_scene("pattern"))
     with Rig(load_rig(tmp_path / "rig.toml", {"cameras.b.serial": "other"})) as rig:
-        assert rig.describe() == {"simulated": True}
+        assert rig.describe() == {"simulated": True, "plugins": []}
         camera = rig.openers()["a"]()
         camera.arm()
         rig.trigger.prepare(run_of(rig.config))

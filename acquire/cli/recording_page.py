@@ -105,6 +105,12 @@ def recording_facts(facts: dict[str, Any]) -> dict[str, Any]:
         "simulated": "yes" if facts["simulated"] else "no",
         "imported": _imported(facts["imported"]),
         "written by": f"acquire {facts['versions']['acquire']}",
+        "plug-ins": _some(
+            [
+                f"{one['kind']} {one['name']} of {one['distribution']} {one['version']}"
+                for one in facts["plugins"] or ()
+            ]
+        ),
     }
 
 

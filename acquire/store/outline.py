@@ -218,6 +218,7 @@ class Outline:
             "ledger": self.attrs["ledger"],
             "durability": self.attrs.get("durability", {}),
             "versions": self.attrs["versions"],
+            "plugins": self.attrs.get("plugins"),
         }
 
     def _code_facts(self) -> dict[str, Any]:
