@@ -282,13 +282,18 @@ def _nameless(directory: Path) -> ShardFile:
 
 def tree_bytes(path: Path) -> int:
     """Return the bytes of all files below ``path``."""
-    size = 0
-    for _, files in _walk(path):
-        for file in files:
-            # Of a growing recording, commits rename files and retention removes some at any moment.
-            with suppress(FileNotFoundError):
-                found = file.stat()
-                size += found.st_size if stat.S_ISREG(found.st_mode) else 0
+    size, left = 0, [os.fspath(path)]
+    # Without a Path for each file: lists of recordings come to tens of thousands.
+    while left:
+        # Of a growing recording, commits rename files and retention removes some at any moment.
+        with suppress(OSError), os.scandir(left.pop()) as entries:
+            for entry in entries:
+                if entry.is_dir(follow_symlinks=False):
+                    left.append(entry.path)
+                    continue
+                with suppress(FileNotFoundError):
+                    found = entry.stat()
+                    size += found.st_size if stat.S_ISREG(found.st_mode) else 0
     return size
 
 
