@@ -104,7 +104,7 @@ class UsbTransport:
             raise TriggerError(f"{self.name} took {sent} of {len(data)} bytes")
 
     def close(self) -> None:
-        # Also of a device that was opened and could not be claimed: a handle keeps it from being opened again.
+        # Also a device that was opened and could not be claimed: its handle would stay.
         if self._device is not None:
             usb.util.dispose_resources(self._device)
         self._lock.release()  # last: whoever gets it finds the interface free
