@@ -130,7 +130,9 @@ def _check_simulated_cameras(config: RigConfig) -> None:
     """
     trigger, variant = config.trigger, _trigger(config)
     if not variant.simulated:
-        drivers = ", ".join(sorted({config.cameras.arm(arm).driver for arm in ARMS}))
+        # One of the two may be real.
+        named = {arm: config.cameras.arm(arm).driver for arm in ARMS}
+        drivers = ", ".join(f"{arm}: {name}" for arm, name in named.items() if CAMERAS.load(name).simulated)
         raise ConfigError(
             f"simulated cameras ({drivers}) cannot be triggered by trigger.driver = {trigger.driver!r}",
             possible="a simulated trigger, such as 'simulated'",
