@@ -37,7 +37,7 @@ _KINDS = (
 )
 
 
-_NESTS = frozenset({dict, list})
+_NESTS: frozenset[type] = frozenset({dict, list})
 
 
 def path_of(place: object) -> Path:
@@ -94,8 +94,8 @@ def parse_object(data: bytes) -> dict[str, Any]:
         level = [
             value
             for node in level
-            for value in (node.values() if node.__class__ is dict else node)
-            if value.__class__ in _NESTS  # what `json` makes has no other class; several times faster
+            for value in (node.values() if isinstance(node, dict) else node)
+            if type(value) in _NESTS  # what `json` makes has no other class; several times faster
         ]
         if not level:
             return document

@@ -70,7 +70,9 @@ class Rig:
 
     def describe(self) -> dict[str, Any]:
         """Return what a recording must state about the origin of its lines (JSON)."""
-        origin = {"simulated": False} if self._simulated is None else self._simulated.describe()
+        origin: dict[str, Any] = (
+            {"simulated": False} if self._simulated is None else self._simulated.describe()
+        )
         config = self.config
         drivers = [(TRIGGERS, config.trigger.driver)]
         if config.simulation.replay is None:  # otherwise no camera is opened

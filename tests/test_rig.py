@@ -12,13 +12,19 @@ import numpy as np
 import pytest
 
 from acquire.config import builtin_directory, load_rig, load_scene
+from acquire.config.base import FilePath
+from acquire.daemon.plan import Run
+from acquire.daemon.proof import Proof
 from acquire.errors import ConfigError, UsageError
 from acquire.geometry import Geometry
+from acquire.plugins import Group
 from acquire.rig import Rig, open_trigger
 from acquire.sim import build_scene, truth
+from acquire.sim.drivers import SimulatedTrigger
 from acquire.sim.leds import LedSceneConfig
 from acquire.simulate import simulate
 from acquire.store import open_recording
+from acquire.store.spec import root_attributes
 from acquire.trigger.base import TriggerRun
 
 OVERRIDES = {"geometry.stages": 8, "stream.block_lines": 16, "simulation.speed": 20.0}
@@ -268,3 +274,35 @@ def test_on_the_gateware_each_camera_follows_its_own_trigger_pin(config):
         assert [wire.arm for wire in wires] == ["a", "b"]
         assert all(wire.read().train is None for wire in wires)
     assert open_descriptors() == before
+
+
+def test_beside_a_real_trigger_only_the_simulated_camera_is_named():
+    """Both cameras' drivers were called simulated."""
+    mixed = {"cameras.a.driver": "harvesters", "trigger.driver": "serial", "trigger.url": "/dev/ttyUSB0"}
+    config = load_rig("rig-demo", mixed)
+    with pytest.raises(ConfigError, match=r"simulated cameras \(b: simulated\) cannot be triggered by"):
+        Rig(config)
+
+
+def test_a_path_among_the_options_of_a_plug_in_reaches_the_recording_as_text(tmp_path, monkeypatch):
+    """A recording's attributes are JSON."""
+
+    class Charted(SimulatedTrigger):
+        chart: FilePath
+
+    load = Group.load
+    monkeypatch.setattr(
+        Group, "load", lambda group, name: Charted if name == "charted" else load(group, name)
+    )
+    named = {"trigger.driver": "charted", "trigger.options": {"chart": "levels.csv"}}
+    config = load_rig("rig-demo", named | {"recording.directory": str(tmp_path), "recording.codec": "none"})
+    assert config.trigger.options == Charted(chart="levels.csv")
+    with Rig(config) as rig:
+        run = Run(config, rig, Proof(config).choose)
+        try:
+            run.arm()
+            attributes = json.loads(json.dumps(root_attributes(run.spec())))
+        finally:
+            run.capture.close()
+    for settings in (attributes["trigger"]["settings"], attributes["config"]["trigger"]):
+        assert settings["options"] == {"chart": "levels.csv"}

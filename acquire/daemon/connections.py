@@ -209,7 +209,8 @@ class ApiServer(uvicorn.Server):
             timeout_graceful_shutdown=GRACE_S,
         )
         super().__init__(config)
-        self._listeners = [listener]
+        self._listeners: list[socket.socket] = [listener]
+        self._listener = listener
         self.answering = asyncio.Event()
 
     @contextlib.contextmanager
@@ -229,13 +230,13 @@ class ApiServer(uvicorn.Server):
 
     async def move(self, listener: Listener) -> None:
         """Accept connections on another listener from now on; those that exist continue."""
-        before, (old,) = self.servers, self._listeners
+        before, old = self.servers, self._listener
         await super().startup([listener])
-        self._listeners[:] = [listener]
+        self._listeners[:], self._listener = [listener], listener
         self._keep_spare()
         for server in before:
             server.close()
         old.close()
 
     def _keep_spare(self) -> None:
-        self._listeners[0].keep_spare()
+        self._listener.keep_spare()
