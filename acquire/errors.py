@@ -8,6 +8,7 @@
     │   └── PlaceError          2  nothing of the kind is at a path or URL, or this user may not use it
     ├── NoDaemonError           3  no daemon answers on the control socket
     ├── StateError              4  the daemon cannot do this now
+    │   └── BusyError           4  too many requests are waiting: the same one succeeds later
     ├── DeviceError             5  trigger, camera or host hardware
     │   ├── TriggerError        5
     │   ├── CameraError         5
@@ -88,6 +89,10 @@ class StateError(AcquireError):
     """The daemon's state does not allow the command."""
 
     exit_code = 4
+
+
+class BusyError(StateError):
+    """As many requests as can wait are waiting already; the same one succeeds later."""
 
 
 class DeviceError(AcquireError):

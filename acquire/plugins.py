@@ -22,10 +22,13 @@ from dataclasses import dataclass, replace
 from functools import cache
 from importlib import metadata
 from pathlib import Path
-from typing import Any, get_args
+from typing import TYPE_CHECKING, Any, get_args
 
 from acquire.errors import ConfigError
 from acquire.text import shortened, shown
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
 
 OURS = "tdi-acquire"
 _ENTRY_POINTS = "entry-points"
@@ -251,6 +254,24 @@ def raised_by(error: BaseException) -> str:
             if getattr(module, "__file__", None) in files:
                 return f"{plugin.entry.module} of {plugin.origin}"
     return ""
+
+
+def of_others(named: Iterable[tuple[Group, str]]) -> list[dict[str, str]]:
+    """Return which of these variants come from other distributions, as recordings and videos state it (JSON).
+
+    Each once, in the order given. A name that is not, or no longer, installed is left out.
+    """
+    found = {}
+    for group, name in named:
+        for plugin in group.found():
+            if plugin.name == name and plugin.distribution != OURS and not plugin.refused:
+                found[group, name] = {
+                    "kind": group.what,
+                    "name": name,
+                    "distribution": plugin.distribution,
+                    "version": plugin.version,
+                }
+    return list(found.values())
 
 
 def unknown_groups() -> dict[str, list[str]]:

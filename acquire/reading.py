@@ -37,6 +37,9 @@ _KINDS = (
 )
 
 
+_NESTS: frozenset[type] = frozenset({dict, list})
+
+
 def path_of(place: object) -> Path:
     """Return the path that a caller gave as a Path or a text. Raises PlaceError for anything else."""
     if not isinstance(place, str | os.PathLike) or "\0" in str(place):
@@ -92,7 +95,7 @@ def parse_object(data: bytes) -> dict[str, Any]:
             value
             for node in level
             for value in (node.values() if isinstance(node, dict) else node)
-            if isinstance(value, dict | list)
+            if type(value) in _NESTS  # what `json` makes has no other class; several times faster
         ]
         if not level:
             return document

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, Self, cast
 
 from acquire.errors import AcquireError, ConfigError, TriggerError, UsageError
 from acquire.lines import ARMS
+from acquire.plugins import CAMERAS, TRIGGERS, of_others
 
 if TYPE_CHECKING:
     from types import TracebackType
@@ -69,7 +70,14 @@ class Rig:
 
     def describe(self) -> dict[str, Any]:
         """Return what a recording must state about the origin of its lines (JSON)."""
-        return {"simulated": False} if self._simulated is None else self._simulated.describe()
+        origin: dict[str, Any] = (
+            {"simulated": False} if self._simulated is None else self._simulated.describe()
+        )
+        config = self.config
+        drivers = [(TRIGGERS, config.trigger.driver)]
+        if config.simulation.replay is None:  # otherwise no camera is opened
+            drivers = [*((CAMERAS, config.cameras.arm(arm).driver) for arm in ARMS), *drivers]
+        return {**origin, "plugins": [*of_others(drivers), *origin.get("plugins", ())]}
 
     @property
     def layout(self) -> str:
@@ -124,7 +132,9 @@ def _check_simulated_cameras(config: RigConfig) -> None:
     """
     trigger, variant = config.trigger, _trigger(config)
     if not variant.simulated:
-        drivers = ", ".join(sorted({config.cameras.arm(arm).driver for arm in ARMS}))
+        # One of the two may be real.
+        named = {arm: config.cameras.arm(arm).driver for arm in ARMS}
+        drivers = ", ".join(f"{arm}: {name}" for arm, name in named.items() if CAMERAS.load(name).simulated)
         raise ConfigError(
             f"simulated cameras ({drivers}) cannot be triggered by trigger.driver = {trigger.driver!r}",
             possible="a simulated trigger, such as 'simulated'",

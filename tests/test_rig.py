@@ -12,13 +12,19 @@ import numpy as np
 import pytest
 
 from acquire.config import builtin_directory, load_rig, load_scene
+from acquire.config.base import FilePath
+from acquire.daemon.plan import Run
+from acquire.daemon.proof import Proof
 from acquire.errors import ConfigError, UsageError
 from acquire.geometry import Geometry
+from acquire.plugins import Group
 from acquire.rig import Rig, open_trigger
 from acquire.sim import build_scene, truth
+from acquire.sim.drivers import SimulatedTrigger
 from acquire.sim.leds import LedSceneConfig
 from acquire.simulate import simulate
 from acquire.store import open_recording
+from acquire.store.spec import root_attributes
 from acquire.trigger.base import TriggerRun
 
 OVERRIDES = {"geometry.stages": 8, "stream.block_lines": 16, "simulation.speed": 20.0}
@@ -92,7 +98,7 @@ def test_the_description_in_a_recording_rebuilds_the_scene(config):
 
 def test_a_rig_of_real_cameras_is_not_called_simulated():
     with Rig(load_rig("rig-vt-4k5c-h100")) as rig:
-        assert rig.describe() == {"simulated": False}
+        assert rig.describe() == {"simulated": False, "plugins": []}
         assert rig.layout == "dual"
 
 
@@ -113,7 +119,7 @@ def test_real_devices_need_no_scene_and_nothing_that_makes_one(tmp_path):
         [sys.executable, "-c", code], capture_output=True, text=True, timeout=300, check=True
     )
     facts, modules = done.stdout.splitlines()
-    assert facts == "['a', 'b'] {'simulated': False} dual"
+    assert facts == "['a', 'b'] {'simulated': False, 'plugins': []} dual"
     scenes = {
         f"acquire.sim.{name}" for name in ("scenes", "scene", "pipeline", "lines", "effects", "instrument")
     }
@@ -147,7 +153,7 @@ def test_simulated_cameras_without_a_scene_are_refused_with_a_list_of_scenes(tmp
 def test_stored_lines_are_shown_without_a_scene(tmp_path):
     (tmp_path / "rig.toml").write_text(without_scene("pattern"))
     with Rig(load_rig(tmp_path / "rig.toml", {"cameras.b.serial": "other"})) as rig:
-        assert rig.describe() == {"simulated": True}
+        assert rig.describe() == {"simulated": True, "plugins": []}
         camera = rig.openers()["a"]()
         camera.arm()
         rig.trigger.prepare(run_of(rig.config))
@@ -268,3 +274,35 @@ def test_on_the_gateware_each_camera_follows_its_own_trigger_pin(config):
         assert [wire.arm for wire in wires] == ["a", "b"]
         assert all(wire.read().train is None for wire in wires)
     assert open_descriptors() == before
+
+
+def test_beside_a_real_trigger_only_the_simulated_camera_is_named():
+    """Both cameras' drivers were called simulated."""
+    mixed = {"cameras.a.driver": "harvesters", "trigger.driver": "serial", "trigger.url": "/dev/ttyUSB0"}
+    config = load_rig("rig-demo", mixed)
+    with pytest.raises(ConfigError, match=r"simulated cameras \(b: simulated\) cannot be triggered by"):
+        Rig(config)
+
+
+def test_a_path_among_the_options_of_a_plug_in_reaches_the_recording_as_text(tmp_path, monkeypatch):
+    """A recording's attributes are JSON."""
+
+    class Charted(SimulatedTrigger):
+        chart: FilePath
+
+    load = Group.load
+    monkeypatch.setattr(
+        Group, "load", lambda group, name: Charted if name == "charted" else load(group, name)
+    )
+    named = {"trigger.driver": "charted", "trigger.options": {"chart": "levels.csv"}}
+    config = load_rig("rig-demo", named | {"recording.directory": str(tmp_path), "recording.codec": "none"})
+    assert config.trigger.options == Charted(chart="levels.csv")
+    with Rig(config) as rig:
+        run = Run(config, rig, Proof(config).choose)
+        try:
+            run.arm()
+            attributes = json.loads(json.dumps(root_attributes(run.spec())))
+        finally:
+            run.capture.close()
+    for settings in (attributes["trigger"]["settings"], attributes["config"]["trigger"]):
+        assert settings["options"] == {"chart": "levels.csv"}

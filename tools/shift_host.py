@@ -12,6 +12,7 @@ import sys
 import threading
 import time
 import uuid
+from collections.abc import Iterable
 from pathlib import Path
 
 import psutil
@@ -78,7 +79,7 @@ class Host:
         scene = builtin_directory() / "scene-leds.toml"
         (home / "rig.toml").write_text(RIG.format(home=home, port=self.port, scene=scene))
         self._log = home / "serve.log"
-        self._shared = _shared_memory()
+        self._shared: set[str] = set()
         self._lock = threading.Lock()
         self._soak = Soak()
         self._handles: dict[str, list[tuple[int, int]]] = {}
@@ -123,6 +124,7 @@ class Host:
     def _note(self, name: str, pid: int) -> None:
         try:
             process = psutil.Process(pid)
+            self._shared |= mapped(each.pid for each in (process, *process.children(recursive=True)))
             self._handles.setdefault(name, []).append((process.num_fds(), process.num_threads()))
         except psutil.Error:
             return
@@ -218,9 +220,7 @@ class Host:
         while (left := self._processes()) and time.monotonic() < deadline:
             time.sleep(0.2)
         wrong = [f"process {each.pid} is left: {_words(each)}" for each in left]
-        return wrong + [
-            f"shared memory is left: {name}" for name in _shared_memory() - self._shared - _mapped()
-        ]
+        return wrong + [f"shared memory is left: {name}" for name in left_in_shared_memory(self._shared)]
 
     def _processes(self) -> list[psutil.Process]:
         found = []
@@ -258,14 +258,16 @@ def _words(process: psutil.Process) -> str:
         return "?"
 
 
-def _mapped() -> set[str]:
-    """Names of shared memory that other processes on this host are using."""
-    found = set()  # other tests may run here at the same time; their memory is not our leak
-    for maps in Path("/proc").glob("[0-9]*/maps"):
+def mapped(pids: Iterable[int]) -> set[str]:
+    """Names of shared memory in /dev/shm that these processes have mapped; others' memory is not our leak."""
+    found = set()
+    for pid in pids:
         with contextlib.suppress(OSError):
-            found |= {name for line in maps.read_text().splitlines() for name in _SHARED.findall(line)}
+            maps = Path(f"/proc/{pid}/maps").read_text(encoding="utf-8", errors="replace")
+            found |= set(_SHARED.findall(maps))
     return found
 
 
-def _shared_memory() -> set[str]:
-    return {path.name for path in Path("/dev/shm").iterdir()}
+def left_in_shared_memory(ours: set[str]) -> set[str]:
+    """Those of our names that are still there: a process that maps a semaphore usually removes its name."""
+    return {name for name in ours if Path("/dev/shm", name).exists()}

@@ -38,7 +38,7 @@ import psutil
 from acquire.client import Client
 from acquire.errors import AcquireError
 from tools.results import ROOT, add_option, recorded
-from tools.shift_host import Host
+from tools.shift_host import Host, left_in_shared_memory, mapped
 from tools.shift_strangers import lie, stall
 from tools.soak import own_mb
 
@@ -106,6 +106,7 @@ class Weeks:
         )
         self.done: Counter[str] = Counter()
         self.lives: dict[str, Life] = {}
+        self._shared: set[str] = set()
         self.wrong: list[str] = []
 
     def work(self, until_s: float) -> None:
@@ -205,7 +206,8 @@ class Weeks:
                     life.types.append(dict(counted[1]))
                 life.looks.append(look)
         shared = Life() if "host 0" not in self.lives else self.lives["host 0"]
-        files = sum(1 for path in Path("/dev/shm").iterdir() if path.name.startswith("acquire"))
+        self._shared |= mapped(process.pid for process in processes)
+        files = len(left_in_shared_memory(self._shared))
         shared.looks.append({"recordings": float(self.done["recordings"]), "files in /dev/shm": files})
         self.lives["host 0"] = shared
 

@@ -17,6 +17,7 @@ import os
 import sys
 from typing import TYPE_CHECKING, Any, TextIO
 
+import acquire
 from acquire.cli.interrupts import interrupts_handled
 from acquire.cli.output import json_requested, print_error
 from acquire.cli.usage import build, not_installed, run
@@ -29,6 +30,13 @@ if TYPE_CHECKING:
 
 HOST_ERRORS = (errno.EIO, errno.ENOSPC, errno.EDQUOT, errno.EMFILE, errno.ENFILE, errno.ENOMEM)
 """Errors caused by the host (a resource that ran out, a device that failed) and not by the request."""
+
+
+_INCOMPLETE = AcquireError(
+    "the installation is incomplete: acquire/__init__.py is missing, as after the removal of another "
+    "distribution with a package `acquire`, such as acquire-imaging",
+    hint="pip install --force-reinstall --no-deps tdi-acquire",
+)
 
 
 def __getattr__(name: str) -> Any:
@@ -48,7 +56,7 @@ def main() -> int:
             nowhere = os.open(os.devnull, os.O_RDWR)
             os.set_inheritable(nowhere, True)  # child processes need the streams, too
             setattr(sys, name, os.fdopen(nowhere, "w" if fd else "r", encoding="utf-8"))
-    code = _carry_out()
+    code = _carry_out() if acquire.__file__ else _failed(_INCOMPLETE)
     # Otherwise the interpreter would try to write the rest at exit, fail, and change the exit code.
     _is_full(sys.stderr)
     return code

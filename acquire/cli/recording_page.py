@@ -35,6 +35,7 @@ def list_row(facts: dict[str, Any]) -> tuple[str, ...]:
         why = why if len(why) <= CELL_CHARACTERS else why[: CELL_CHARACTERS - 1] + "…"
         return (name, "-", "-", "-", why, "-")
     state = (facts["run_condition"] or facts["state"]) + (", DAMAGED" if facts["damage"] else "")
+    state += ", not sealed" if _is_left(facts) else ""
     size = quantity(facts["bytes"], "B")
     return (name, str(facts["lines"]), f"{facts['duration_s']:.3f} s", size, state, _utc(facts["start_ns"]))
 
@@ -67,6 +68,8 @@ def recording_facts(facts: dict[str, Any]) -> dict[str, Any]:
     elif steps := dict((facts["calibration"] or {}).get("steps", {})):
         # ISO times: the greatest text is the latest.
         calibration = f"{', '.join(steps)}; {max(str(step.get('made', '')) for step in steps.values())}"
+    # A daemon recovers it when it starts; without one, the command does.
+    left = "; no process writes it any more: acquire recover" if _is_left(facts) else ""
     suspect = [
         f"{one['arm']} {one['first_line']} to {one['first_line'] + one['count'] - 1} ({one['why']})"
         for one in facts["suspect"]
@@ -74,7 +77,7 @@ def recording_facts(facts: dict[str, Any]) -> dict[str, Any]:
     return {
         "recording": facts["path"],
         "run": facts["run_id"],
-        "state": f"{facts['state']}, {facts['run_condition'] or 'no condition yet'}",
+        "state": f"{facts['state']}, {facts['run_condition'] or 'no condition yet'}{left}",
         "end": facts["end_reason"],
         "lines": f"{lines} ({first} to {first + lines - 1})" if lines else "0",
         "continues": continues,
@@ -86,8 +89,10 @@ def recording_facts(facts: dict[str, Any]) -> dict[str, Any]:
         "geometry": f"M = {sizes['stages']}, S = {sizes['substeps']}, {sizes['pixels']} pixels",
         "scene": _behind_fibre(sizes),
         "samples": facts["dtype"],
-        # Listed bits may be a megabyte of digits.
-        "code": ", ".join(f"{key} {shortened(value, 60)}" for key, value in facts["code"].items()),
+        # Listed bits may be a megabyte of digits. Without a seed, the register's state was given itself.
+        "code": ", ".join(
+            f"{key} {shortened(value, 60)}" for key, value in facts["code"].items() if value is not None
+        ),
         "clock": f"{facts['clock']['clock_hz']} Hz, {utc}",
         "size": quantity(facts["bytes"], "B"),
         "damaged": facts["damage"],
@@ -100,7 +105,18 @@ def recording_facts(facts: dict[str, Any]) -> dict[str, Any]:
         "simulated": "yes" if facts["simulated"] else "no",
         "imported": _imported(facts["imported"]),
         "written by": f"acquire {facts['versions']['acquire']}",
+        "plug-ins": _some(
+            [
+                f"{one['kind']} {one['name']} of {one['distribution']} {one['version']}"
+                for one in facts["plugins"] or ()
+            ]
+        ),
     }
+
+
+def _is_left(facts: dict[str, Any]) -> bool:
+    """Whether its writer has ended without sealing it."""
+    return facts["state"] != "sealed" and facts["written"] is False
 
 
 def _some(items: Sequence[str]) -> str | None:

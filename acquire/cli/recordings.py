@@ -339,8 +339,8 @@ def _summary(path: Path) -> dict[str, Any] | None:
         return {"path": str(path), "error": error.message}
     except (*DAMAGE, MemoryError) as error:  # one damaged recording must not keep the others off the list
         return {"path": str(path), "error": f"{path} cannot be read: {error}"}
-    keys = ("path", "run_id", "state", "run_condition", "lines", "duration_s", "bytes", "start_ns", "damage")
-    return {key: facts[key] for key in keys}
+    keys = ("path", "run_id", "state", "written", "run_condition", "lines")
+    return {key: facts[key] for key in (*keys, "duration_s", "bytes", "start_ns", "damage")}
 
 
 def _other_kind(path: Path) -> str | None:

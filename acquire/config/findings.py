@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from pydantic import BaseModel, ValidationError
 
 _GROUPS = {group.name: group for group in GROUPS}
+_CONTAINERS = {"tuple_type": "tuple", "list_type": "list", "set_type": "set", "frozen_set_type": "frozenset"}
 MOST_LISTED = 20
 """Largest number of findings that one error lists."""
 
@@ -35,7 +36,7 @@ def explained(error: ValidationError, model: type[BaseModel], path: Path | str) 
     for item in findings[:MOST_LISTED]:
         keys, allowed, secret = _locate(model, item["loc"])
         key = shortened(".".join(keys)) or "(file)"
-        why = shortened(own_words(item["msg"]), 400)
+        why = _why(item)
         # pydantic's own sentence, "Extra inputs are not permitted", does not name the keys that are.
         if item["type"] == "extra_forbidden":
             lines.append(f"  {key}: unknown key; allowed here: {', '.join(allowed) or 'none'}")
@@ -45,10 +46,28 @@ def explained(error: ValidationError, model: type[BaseModel], path: Path | str) 
         elif secret or isinstance(item["input"], dict):
             lines.append(f"  {key}: {why}")
         else:
-            lines.append(f"  {key} = {shown(item['input'])}: {why}")
+            value = item["input"]
+            # As it is in the file: the models turn lists into tuples.
+            lines.append(f"  {key} = {shown(list(value) if isinstance(value, tuple) else value)}: {why}")
     if len(findings) > MOST_LISTED:
         lines.append(f"  and {len(findings) - MOST_LISTED} more")
     return "\n".join(lines)
+
+
+def _why(item: Any) -> str:
+    """Return the reason of a finding; pydantic's own for a wrong container names a class that no file has."""
+    kind, value = item["type"], item["input"]
+    if kind in _CONTAINERS and not isinstance(value, tuple):
+        return "a list is expected"
+    if kind in _CONTAINERS:
+        return (
+            f"the plug-in asks for a {_CONTAINERS[kind]}, which no file can hold; its field should be a tuple"
+        )
+    if kind == "is_instance_of":
+        wanted = str(item["ctx"]["class"])
+        instead = "acquire.config.base.FilePath" if wanted == "Path" else "of a type that TOML has"
+        return f"the plug-in asks for a {wanted}, which no file can hold; its field should be {instead}"
+    return shortened(own_words(item["msg"]), 400)
 
 
 def _locate(model: type[BaseModel], location: tuple[int | str, ...]) -> tuple[list[str], list[str], bool]:

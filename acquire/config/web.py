@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from pydantic import Field, model_validator
+from pydantic import Field, field_validator, model_validator
 
 from acquire.config.base import FilePath, FrozenModel
 
@@ -29,6 +29,14 @@ class WebConfig(FrozenModel):
         description="true: allow an address other than loopback without a certificate; token and pictures "
         "can then be read on the network",
     )
+
+    @field_validator("host")
+    @classmethod
+    def _is_an_address(cls, host: str) -> str:
+        # To a socket, an empty text is every address, which one should have to ask for by its name.
+        if not host or host != "".join(host.split()):
+            raise ValueError("not an address; possible: 127.0.0.1, or 0.0.0.0 for every address of this host")
+        return host
 
     @model_validator(mode="after")
     def _closed_to_strangers(self) -> WebConfig:

@@ -202,13 +202,14 @@ class ApiServer(uvicorn.Server):
             log_config=None,
             access_log=False,
             lifespan="off",
-            http=functools.partial(Connection, on_lost=listener.keep_spare),  # type: ignore[arg-type]
+            http=functools.partial(Connection, on_lost=self._keep_spare),  # type: ignore[arg-type]
             ws="none",
             backlog=AT_ONCE,
             timeout_keep_alive=IDLE_S,
             timeout_graceful_shutdown=GRACE_S,
         )
         super().__init__(config)
+        self._listeners: list[socket.socket] = [listener]
         self._listener = listener
         self.answering = asyncio.Event()
 
@@ -223,5 +224,19 @@ class ApiServer(uvicorn.Server):
 
     async def answer(self) -> None:
         """Serve until `should_exit`."""
+        self._keep_spare()
+        # The same list in `move`: what is in it when the server ends is closed.
+        await self.serve(sockets=self._listeners)
+
+    async def move(self, listener: Listener) -> None:
+        """Accept connections on another listener from now on; those that exist continue."""
+        before, old = self.servers, self._listener
+        await super().startup([listener])
+        self._listeners[:], self._listener = [listener], listener
+        self._keep_spare()
+        for server in before:
+            server.close()
+        old.close()
+
+    def _keep_spare(self) -> None:
         self._listener.keep_spare()
-        await self.serve(sockets=[self._listener])

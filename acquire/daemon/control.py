@@ -17,9 +17,9 @@ from starlette.exceptions import HTTPException
 
 from acquire import __version__
 from acquire.daemon.answers import Answers
-from acquire.daemon.messages import HTTP_STATUS, ErrorMessage, error_body, http_status
+from acquire.daemon.messages import HTTP_STATUS, RETRY, ErrorMessage, error_body, http_status
 from acquire.daemon.routes import routes
-from acquire.errors import AcquireError, UsageError
+from acquire.errors import AcquireError, BusyError, UsageError
 from acquire.text import own_words, shortened, shown
 
 if TYPE_CHECKING:
@@ -153,4 +153,5 @@ def _add_errors(app: FastAPI) -> None:
 
 
 def _answer(error: AcquireError) -> JSONResponse:
-    return JSONResponse(error_body(error), status_code=http_status(error))
+    headers = RETRY if isinstance(error, BusyError) else None
+    return JSONResponse(error_body(error), http_status(error), headers)

@@ -4,14 +4,12 @@ The default socket is in a directory that only its user can enter; a directory t
 first, in /tmp, is refused. `acquire.daemon.peer` is the client's counterpart.
 
 A lock on a file next to the socket shows whether a daemon is alive. The kernel releases it however the
-process ends, so that a socket left behind by a killed daemon is recognised and replaced. The lock file stays:
-removing it would let two daemons lock two files of the same name.
+process ends, so that a socket left behind by a killed daemon is recognised and replaced.
 """
 
 from __future__ import annotations
 
 import contextlib
-import fcntl
 import os
 import socket
 import stat
@@ -21,11 +19,10 @@ from acquire.daemon.connections import Listener
 from acquire.daemon.peer import ELSEWHERE
 from acquire.errors import StateError, UsageError
 from acquire.place import default_socket
+from acquire.processes.lockfile import LockFile, identity_of
 
 LONGEST_PATH = 107
 """Longest path of a Unix socket that the kernel accepts, in bytes."""
-LONGEST_LOCK = 32
-"""Largest lock file, in bytes: a process number and a newline."""
 
 
 class Endpoint:
@@ -43,39 +40,69 @@ class Endpoint:
                 possible=f"a path of at most {LONGEST_PATH} bytes",
                 hint=ELSEWHERE,
             )
-        # The directory of any other path was chosen by the user, who may share it; clients look at it
-        # (`peer`).
-        if path == default_socket():
-            _own(path.parent)
-        if not path.parent.is_dir():
-            raise UsageError(f"control socket {path}: its directory does not exist", hint=ELSEWHERE)
+        _check_directory(path)
         if os.path.lexists(path) and not stat.S_ISSOCK(path.lstat().st_mode):
             raise UsageError(f"control socket {path}: something else is there, and is left untouched")
+        self._closed = False
         self._lock = _lock(path)
         try:
             self.socket = _listen(path)
         except BaseException:
-            os.close(self._lock)
+            self._lock.close()
             raise
+        self._identity = identity_of(path)
+
+    def renewed(self) -> Listener | None:
+        """Make lock and socket again if their names were removed; return a new socket, or None.
+
+        Raises as the construction does. What another program put in their place is left untouched.
+        """
+        if not self._lock.is_there:
+            _check_directory(self.path)
+            lock = _lock(self.path)
+            self._lock.close()
+            self._lock = lock
+        found = identity_of(self.path)
+        if found is not None and found == self._identity:
+            return None
+        if found is not None:
+            raise UsageError(
+                f"control socket {self.path}: something else is there now, and is left untouched",
+                hint=f"remove it, and the daemon (process {os.getpid()}) is reachable again",
+            )
+        self.socket = _listen(self.path)
+        self._identity = identity_of(self.path)
+        return self.socket
 
     def remove(self) -> None:
         """Remove the socket's name. May be called from any thread; the lock ends with the process."""
-        with contextlib.suppress(OSError):
-            self.path.unlink(missing_ok=True)
+        # Something else may have taken its place.
+        if identity_of(self.path) == self._identity:
+            with contextlib.suppress(OSError):
+                self.path.unlink(missing_ok=True)
 
     def close(self) -> None:
         """Remove the socket and let the next daemon in. Idempotent."""
-        if self._lock < 0:
+        if self._closed:
             return
+        self._closed = True
         self.socket.close()
         # Before the lock is released: afterwards the name may be that of the next daemon's socket.
         self.remove()
-        os.close(self._lock)
-        self._lock = -1
+        self._lock.close()
 
 
 def lock_path(path: Path) -> Path:
     return path.with_name(path.name + ".lock")
+
+
+def _check_directory(path: Path) -> None:
+    # The directory of any other path was chosen by the user, who may share it; clients look at it
+    # (`peer`).
+    if path == default_socket():
+        _own(path.parent)
+    if not path.parent.is_dir():
+        raise UsageError(f"control socket {path}: its directory does not exist", hint=ELSEWHERE)
 
 
 def _own(directory: Path) -> None:
@@ -106,40 +133,32 @@ def _own(directory: Path) -> None:
         )
 
 
-def _lock(path: Path) -> int:
-    # If others can write to the directory, a link could make us truncate another file, a pipe wait for ever.
-    flags = os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK
+def _lock(path: Path) -> LockFile:
+    name = lock_path(path)
     try:
-        lock = os.open(lock_path(path), flags, 0o600)
+        lock = LockFile(name)
     except OSError as error:
-        raise UsageError(f"control socket {path}: cannot lock {lock_path(path)}: {error.strerror}") from error
-    found = os.fstat(lock)
-    if not stat.S_ISREG(found.st_mode) or found.st_size > LONGEST_LOCK:
-        os.close(lock)
         raise UsageError(
-            f"control socket {path}: {lock_path(path)} is not a lock of acquire, and is left untouched"
-        )
+            f"control socket {path}: cannot lock {name}: {error.strerror}", hint=ELSEWHERE
+        ) from error
     try:
-        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        # Only under the lock: until then the file has the number of its owner, which the refusal names.
-        os.ftruncate(lock, 0)
-        os.pwrite(lock, f"{os.getpid()}\n".encode(), 0)
+        lock.take()
     except BlockingIOError:
-        owner = os.pread(lock, LONGEST_LOCK, 0).decode("ascii", "replace").strip()
-        os.close(lock)
-        known = owner.isdecimal()
-        owner = owner if known else "unknown"
+        owner = lock.owner
+        lock.close()
         if not os.path.lexists(path):  # otherwise each of two commands would send the user to the other
             raise StateError(
                 f"another daemon (process {owner}) listens on {path}, which was removed",
-                hint=f"kill {owner}, after which it seals its recording and ends" if known else "",
+                hint=f"kill {owner}, after which it seals its recording and ends"
+                if owner.isdecimal()
+                else "",
             ) from None
         raise StateError(
             f"another daemon (process {owner}) listens on {path}", hint="acquire status, or another --socket"
         ) from None
     except OSError as error:
-        os.close(lock)
-        raise UsageError(f"control socket {path}: cannot lock {lock_path(path)}: {error.strerror}") from error
+        lock.close()
+        raise UsageError(f"control socket {path}: cannot lock {name}: {error.strerror}") from error
     return lock
 
 

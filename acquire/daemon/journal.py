@@ -2,21 +2,59 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import logging
+import os
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from acquire.errors import StateError, UsageError
+from acquire.processes.lockfile import LockFile
 from acquire.reading import read_object
-from acquire.store.files import Publisher
+from acquire.store.files import NO_LOCKS, Publisher
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
+    from collections.abc import Iterable, Iterator
 
 MOST_PATHS = 10_000
 """Number of entries of a journal that are read."""
+_OTHERWISE = "a name of its own in its rig file, or --set name=NAME; or another recording.directory"
 
 log = logging.getLogger("acquire.daemon")
+
+
+def journal_path(directory: Path, name: str, what: str) -> Path:
+    """Return the file in which the rig ``name`` lists recordings that are not sealed, or not copied, yet."""
+    return directory / f".{what}-{name}.json"
+
+
+@contextlib.contextmanager
+def only_user(directory: Path, name: str) -> Iterator[None]:
+    """Keep the journals of the rig ``name`` in ``directory`` from every other daemon.
+
+    Raises StateError if one uses them: each would overwrite the other's lists. A directory that cannot be
+    locked is logged.
+    """
+    path = directory / f".recordings-{name}.lock"
+    with contextlib.ExitStack() as stack:
+        try:
+            # Whoever may write to the directory may follow this daemon.
+            lock = LockFile(path, directory.stat().st_mode & 0o666)
+            stack.callback(lock.close)
+            lock.take()
+        except BlockingIOError:
+            raise StateError(
+                f"another daemon (process {lock.owner}) of a rig named {name} records into {directory}",
+                hint=_OTHERWISE,
+            ) from None
+        except OSError as error:
+            if os.path.lexists(path) and error.errno not in NO_LOCKS:
+                raise UsageError(
+                    f"{path}, which keeps two daemons of one rig apart: {error.strerror}", hint=_OTHERWISE
+                ) from error
+            log.warning("a second daemon of this rig would not be noticed: %s: %s", path, error.strerror)
+        yield
 
 
 class Journal:

@@ -14,7 +14,7 @@ from pydantic import BaseModel, ConfigDict, Field, PlainSerializer, field_valida
 from acquire import errors
 from acquire.daemon.options import LightCode
 from acquire.daemon.states import State
-from acquire.errors import AcquireError, DeviceError, StateError, UsageError
+from acquire.errors import AcquireError, BusyError, DeviceError, StateError, UsageError
 from acquire.text import visible
 
 
@@ -378,11 +378,16 @@ class ErrorMessage(Message):
 
 HTTP_STATUS: tuple[tuple[type[AcquireError], int], ...] = (
     (UsageError, 422),
+    (BusyError, 503),
     (StateError, 409),
     (DeviceError, 503),
     (AcquireError, 500),
 )
 """The first class that matches decides."""
+
+
+RETRY = {"Retry-After": "1"}
+"""Header of an answer that is another one a second later."""
 
 
 def http_status(error: AcquireError) -> int:

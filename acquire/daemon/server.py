@@ -23,12 +23,14 @@ from acquire.daemon.control import build_app
 from acquire.daemon.ending import END_S, LastResort, leave
 from acquire.daemon.endpoint import Endpoint
 from acquire.daemon.hooks import Hooks
+from acquire.daemon.journal import journal_path, only_user
 from acquire.daemon.local import Local
 from acquire.daemon.messages import ArmRequest
 from acquire.daemon.notify import notify
 from acquire.daemon.page import Page
 from acquire.daemon.plan import Run, armed_as, worker_modules
 from acquire.daemon.proof import Proof
+from acquire.daemon.reachable import stay_reachable
 from acquire.daemon.reload import Reloading
 from acquire.daemon.salvage import Salvage
 from acquire.daemon.service import Service
@@ -36,13 +38,12 @@ from acquire.daemon.states import State
 from acquire.daemon.troubles import Troubles
 from acquire.daemon.uploads import Uploads
 from acquire.daemon.who import WHO
-from acquire.errors import EXIT_INTERRUPTED, AcquireError, StateError
+from acquire.errors import EXIT_INTERRUPTED, AcquireError, BusyError, StateError
 from acquire.processes.nursery import nursery, warm_up
 from acquire.rig import Rig, check_rig
 
 if TYPE_CHECKING:
     from collections.abc import Callable
-    from pathlib import Path
 
     from acquire.config import RigConfig
 
@@ -64,18 +65,23 @@ T = TypeVar("T")
 def serve(config: RigConfig, origin: str = "", reread: Callable[[], RigConfig] | None = None) -> int:
     """Own the devices of ``config``, read from the file ``origin``, until a signal; return the exit code.
 
-    ``reread`` reads the configuration again. Raises StateError if another daemon has the socket, before any
-    device is touched.
+    ``reread`` reads the configuration again. Raises StateError if another daemon has the socket, or the lists
+    of this rig's recordings, before any device is touched.
     """
     raise_descriptor_limit()
     troubles = Troubles()
     threading.excepthook = troubles.in_thread
-    with contextlib.closing(Endpoint(config.control.socket.absolute())) as endpoint, Rig(config) as rig:
+    directory = config.recording.directory.absolute()
+    with (
+        contextlib.closing(Endpoint(config.control.socket.absolute())) as endpoint,
+        only_user(directory, config.name),
+        Rig(config) as rig,
+    ):
         # First: it imports modules while the rest begins, so that the first `arm` need not wait for it.
         warm_up(*worker_modules(rig))
-        salvage = Salvage(config.recording.directory.absolute(), _journal(config, "recordings"))
+        salvage = Salvage(directory, journal_path(directory, config.name, "recordings"))
         salvage.search()
-        uploads = Uploads(config.recording.upload_to, _journal(config, "uploads"))
+        uploads = Uploads(config.recording.upload_to, journal_path(directory, config.name, "uploads"))
         uploads.begin()
         proof = Proof(config)
 
@@ -110,11 +116,6 @@ def ends_with_terminal() -> bool:
     except OSError:
         return False
     return True
-
-
-def _journal(config: RigConfig, what: str) -> Path:
-    """Return the file that lists recordings that are not copied, or not sealed, yet."""
-    return config.recording.directory.absolute() / f".{what}-{config.name}.json"
 
 
 class Daemon:
@@ -159,10 +160,14 @@ class Daemon:
             notify("READY=1")
         watchdog = asyncio.create_task(self._feed_watchdog())
         beginning = asyncio.create_task(begin(self._service.config.service, self._service, self._command))
+        reachable = asyncio.create_task(
+            stay_reachable(self._endpoint, self._server, self._service.news, self._troubles)
+        )
         try:
             await self._supervise(serving)
         finally:
             beginning.cancel()
+            reachable.cancel()
             await self._end(serving)
             watchdog.cancel()
             self._last_resort.cancel()
@@ -223,7 +228,7 @@ class Daemon:
             raise StateError("the daemon is ending", possible="status")
         # One more than may wait, since one of them is being carried out.
         if self._waiting > MOST_WAITING:
-            raise StateError(f"{MOST_WAITING} commands are waiting already", possible="status")
+            raise BusyError(f"{MOST_WAITING} commands are waiting already", possible="status")
         self._waiting += 1
         try:
             await self._in_device_thread(work)

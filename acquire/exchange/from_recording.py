@@ -25,7 +25,7 @@ BLOCK_BYTES = 2**23
 """Size of the pixels that are in memory at a time."""
 FACTS = (
     "run_id", "run_condition", "end_reason", "layout", "geometry", "trigger", "code", "clock", "cameras",
-    "simulated", "imported", "versions",
+    "simulated", "imported", "versions", "plugins",
 )  # fmt: skip
 """Attributes of a recording that are copied into an export."""
 

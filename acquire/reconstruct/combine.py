@@ -16,6 +16,7 @@ import numpy as np
 from acquire import __version__
 from acquire.calibrate.choose import provenance
 from acquire.errors import AcquireError
+from acquire.plugins import DENOISERS, SOLVERS, of_others
 from acquire.recon.diagnosis import TURNED
 from acquire.recon.error import combined_facts
 from acquire.recon.segments import Stitcher
@@ -231,6 +232,7 @@ def describe_parts(
         "calibration": provenance(options.calibration),
         "turned": TURNED.get(options.turn),
         "versions": {"acquire": __version__},
+        "plugins": of_others([(SOLVERS, options.solver), (DENOISERS, options.denoiser or "")]),
     }
 
 

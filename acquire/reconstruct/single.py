@@ -7,6 +7,7 @@ from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
 from acquire import __version__
+from acquire.plugins import SOLVERS, of_others
 from acquire.recon.error import error_facts
 from acquire.store import write_video
 
@@ -64,4 +65,5 @@ def describe(result: Reconstruction, recording: Recording, segment: Segment) -> 
         "trusted": [result.trusted.start, result.trusted.stop],
         "warnings": list(result.warnings),
         "versions": {"acquire": __version__},
+        "plugins": of_others([(SOLVERS, result.solver)]),
     }

@@ -24,6 +24,7 @@ import numpy as np
 from acquire.config.scene import OpticsConfig
 from acquire.errors import UsageError
 from acquire.lines import ARMS
+from acquire.plugins import EFFECTS, SCENES, of_others
 from acquire.sim.effects import in_order
 from acquire.sim.effects.base import TILE_LINES, Setting, Stage
 from acquire.sim.light import Illumination
@@ -33,7 +34,7 @@ from acquire.sim.readout import Readout
 from acquire.sim.scenes import build_scene
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Iterator, Mapping, Sequence
 
     from numpy.typing import NDArray
 
@@ -42,6 +43,7 @@ if TYPE_CHECKING:
     from acquire.config.device import CameraConfig
     from acquire.config.scene import SceneConfig
     from acquire.fibre import Fibre
+    from acquire.plugins import Group
     from acquire.sim.scene import Scene
     from acquire.sim.stopwatch import Stopwatch
 
@@ -298,7 +300,18 @@ def _check_shape(stage: Stage, given: NDArray[Any], found: NDArray[Any]) -> NDAr
 def describe(scene: SceneConfig) -> dict[str, Any]:
     """Return the scene as stored in its recording, with the effects in the order in which they act (JSON)."""
     effects = [effect.model_dump(mode="json") for effect in in_order(scene.effects)]
-    return {"simulated": True, "scene": scene.model_dump(mode="json"), "effects": effects}
+    return {
+        "simulated": True,
+        "scene": scene.model_dump(mode="json"),
+        "effects": effects,
+        "plugins": of_others([*_scene_kinds(scene), *((EFFECTS, each.kind) for each in scene.effects)]),
+    }
+
+
+def _scene_kinds(scene: SceneConfig) -> Iterator[tuple[Group, str]]:
+    yield SCENES, scene.kind
+    for part in getattr(scene, "parts", ()):  # of a sum of scenes
+        yield from _scene_kinds(part)
 
 
 def _sensor(

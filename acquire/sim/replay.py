@@ -64,7 +64,8 @@ def replay_code(recording: Recording) -> Code:
 def describe_replay(path: Path) -> dict[str, Any]:
     """Return the origin of replayed lines for the new recording, as the first recording states it (JSON)."""
     attrs = open_recording(path).attrs
-    kept: dict[str, Any] = {key: attrs[key] for key in ("simulated", "scene", "effects") if key in attrs}
+    keys = ("simulated", "scene", "effects", "plugins")
+    kept: dict[str, Any] = {key: attrs[key] for key in keys if key in attrs}
     return {**kept, "replayed": {"run_id": attrs["run_id"], "first_line": attrs["first_line"]}}
 
 

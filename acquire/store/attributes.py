@@ -192,6 +192,7 @@ _ROOT = _record(
         "imported": _maybe(_record({"files": _table(_object), "unknown": _each(_text)})),
         "host": _table(_text),
         "durability": _durability,
+        "plugins": _each(_record({"kind": _text, "name": _text, "distribution": _text, "version": _text})),
         "simulated": _truth,
         "dropped": _each(_stretch),
         "holds": _each(_hold),

@@ -282,13 +282,18 @@ def _nameless(directory: Path) -> ShardFile:
 
 def tree_bytes(path: Path) -> int:
     """Return the bytes of all files below ``path``."""
-    size = 0
-    for _, files in _walk(path):
-        for file in files:
-            # Of a growing recording, commits rename files and retention removes some at any moment.
-            with suppress(FileNotFoundError):
-                found = file.stat()
-                size += found.st_size if stat.S_ISREG(found.st_mode) else 0
+    size, left = 0, [os.fspath(path)]
+    # Without a Path for each file: lists of recordings come to tens of thousands.
+    while left:
+        # Of a growing recording, commits rename files and retention removes some at any moment.
+        with suppress(OSError), os.scandir(left.pop()) as entries:
+            for entry in entries:
+                if entry.is_dir(follow_symlinks=False):
+                    left.append(entry.path)
+                    continue
+                with suppress(FileNotFoundError):
+                    found = entry.stat()
+                    size += found.st_size if stat.S_ISREG(found.st_mode) else 0
     return size
 
 
@@ -326,6 +331,24 @@ def lock(path: Path, doing: str, *, surely: bool = False) -> int:
                 f"{doing} {path}: its file system has no locks, which would show whether it is being written"
             ) from error
     return fd
+
+
+def is_locked(path: Path) -> bool | None:
+    """Return whether a process has the directory ``path`` locked; None if that cannot be known."""
+    # A shared lock: two that only look do not meet each other.
+    try:
+        fd = os.open(path, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC | os.O_NOFOLLOW)
+    except OSError:
+        return None
+    try:
+        fcntl.flock(fd, fcntl.LOCK_SH | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return True
+    except OSError:
+        return None
+    finally:
+        os.close(fd)
+    return False
 
 
 def _walk(path: Path) -> Iterator[tuple[Path, list[Path]]]:

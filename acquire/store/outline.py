@@ -15,7 +15,7 @@ from acquire.fibre import Fibre
 from acquire.flags import ARMS
 from acquire.geometry import Geometry
 from acquire.store.array_files import COLUMNS, ArmFiles, ArrayFiles
-from acquire.store.files import DISK
+from acquire.store.files import DISK, is_locked
 from acquire.store.opening import opened
 from acquire.store.source import LocalSource, source_of
 from acquire.store.table_reader import read_events, read_gaps
@@ -71,6 +71,13 @@ class Outline:
     def state(self) -> str:
         """``recording`` until it is sealed."""
         return str(self.attrs["state"])
+
+    @property
+    def is_written(self) -> bool | None:
+        """Whether a process of this machine writes it; None if that cannot be known."""
+        if self.state == "sealed":
+            return False
+        return is_locked(self.source.path) if isinstance(self.source, LocalSource) else None
 
     @property
     def first_line(self) -> int:
@@ -185,6 +192,7 @@ class Outline:
         return {
             "path": str(self),
             **{key: self.attrs[key] for key in keys},
+            "written": self.is_written,
             "code": self._code_facts(),
             "first_line": self.first_line,
             "lines": lines,
@@ -210,6 +218,7 @@ class Outline:
             "ledger": self.attrs["ledger"],
             "durability": self.attrs.get("durability", {}),
             "versions": self.attrs["versions"],
+            "plugins": self.attrs.get("plugins"),
         }
 
     def _code_facts(self) -> dict[str, Any]:
@@ -222,8 +231,8 @@ class Outline:
 
     def _disk_facts(self) -> dict[str, float] | None:
         """Return, of a local growing recording, bytes free, bytes per second, and seconds to a full disk."""
-        # A sealed one does not grow, and of a store nobody knows the room.
-        if self.state == "sealed" or not isinstance(self.source, LocalSource) or not self.lines:
+        # One that nobody writes does not grow, and of a store nobody knows the room.
+        if self.is_written is False or not isinstance(self.source, LocalSource) or not self.lines:
             return None
         free = DISK.free_bytes(self.source.path)
         rate = self.source.total_bytes() * NS_PER_S / (self.lines * self.line_period_ns)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import logging
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import asynccontextmanager
@@ -17,7 +18,7 @@ from acquire.daemon.answers import Answers
 from acquire.daemon.control import new_app
 from acquire.daemon.messages import ErrorMessage
 from acquire.daemon.routes import NO_STORE, RequestId, routes
-from acquire.errors import UsageError
+from acquire.errors import AcquireError, BusyError, UsageError
 from acquire.web.archive import Archive
 from acquire.web.calibrations import calibration_facts, place_of
 from acquire.web.guard import Guard
@@ -79,12 +80,22 @@ class Reading:
 
     async def __call__(self, work: Callable[[], T]) -> T:
         if self._waiting >= MOST_READING:
-            raise UsageError("too many requests are reading recordings already", hint="again in a moment")
+            raise BusyError(
+                f"{MOST_READING} requests are reading recordings already", hint="again in a moment"
+            )
         self._waiting += 1
         try:
             return await asyncio.get_running_loop().run_in_executor(self._thread, work)
         finally:
             self._waiting -= 1
+
+    def close(self) -> None:
+        self._thread.shutdown(wait=False, cancel_futures=True)
+
+
+async def _prepare(archive: Archive, reading: Reading) -> None:
+    with contextlib.suppress(AcquireError):  # whoever asks for the list is told
+        await reading(archive.recordings)
 
 
 def build_page(
@@ -100,7 +111,9 @@ def build_page(
 
     @asynccontextmanager
     async def lifespan(_: FastAPI) -> AsyncIterator[None]:
-        tasks = [asyncio.create_task(each) for each in (hub.run(), jobs.run(), hub.glimpser.run())]
+        # The first list of hundreds of recordings takes seconds: it is made before anybody asks.
+        works = (hub.run(), jobs.run(), hub.glimpser.run(), _prepare(archive, reading))
+        tasks = [asyncio.create_task(each) for each in works]
         try:
             yield
         finally:
@@ -108,6 +121,7 @@ def build_page(
                 task.cancel()
             # They must finish: a running job ends its process when it is cancelled.
             await asyncio.gather(*tasks, return_exceptions=True)
+            reading.close()
 
     app = new_app(
         "The instrument's page: the daemon's API, recordings, videos and jobs.",

@@ -17,7 +17,15 @@ from PIL import Image
 
 from acquire.errors import AcquireError, PlaceError, UsageError
 from acquire.flags import ARMS, NO_IMAGE
-from acquire.store import Recording, format_of, hold, open_recording, open_video, taint_words
+from acquire.store import (
+    Recording,
+    format_of,
+    hold,
+    open_outline,
+    open_recording,
+    open_video,
+    taint_words,
+)
 from acquire.store.layout import DAMAGE
 from acquire.store.refusals import refused
 from acquire.store.shortfall import first_shortfall, missing_segments
@@ -35,7 +43,7 @@ from acquire.web.messages import (
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from acquire.store import VideoFile
+    from acquire.store import Outline, VideoFile
 
 MOST_LISTED = 500
 """Largest number of entries in a list; the newest are listed."""
@@ -202,7 +210,7 @@ class Archive:
         if before is not None and before[0] == stamp and stamp is not None:
             return before[1]
         try:
-            known = _facts(path, open_recording(path))
+            known = _facts(path, open_outline(path))
         except AcquireError as error:
             return RecordingFacts(name=path.name, error=shortened(error.message, 300))
         except (*DAMAGE, MemoryError) as error:
@@ -228,7 +236,7 @@ def _remember(cache: OrderedDict[Any, Any], key: Any, value: Any, most: int) -> 
         cache.popitem(last=False)
 
 
-def _facts(path: Path, opened: Recording) -> RecordingFacts:
+def _facts(path: Path, opened: Outline) -> RecordingFacts:
     info = opened.info()
     shortfall = first_shortfall(opened)
     damage = next(missing_segments(opened), None) if shortfall is None else str(shortfall)

@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING
 from starlette.requests import Request
 from starlette.responses import JSONResponse
 
-from acquire.daemon.messages import error_body
+from acquire.daemon.messages import RETRY, error_body
 from acquire.daemon.who import LONGEST, WHO
 from acquire.errors import UsageError
 from acquire.text import shortened
@@ -192,4 +192,4 @@ class Guard:
 
 
 def _refuse(status: int, text: str, hint: str = "") -> JSONResponse:
-    return JSONResponse(error_body(UsageError(text, hint=hint)), status)
+    return JSONResponse(error_body(UsageError(text, hint=hint)), status, RETRY if status == 429 else None)

@@ -192,6 +192,39 @@ def test_info(cli: Cli, tmp_path: Path) -> None:
     assert facts["run_condition"] == "INCOMPLETE"
 
 
+def test_a_recording_whose_writer_was_killed_is_not_shown_as_if_it_grew(cli: Cli, tmp_path: Path) -> None:
+    path = tmp_path / "left.zarr"
+    with RecordingWriter.create(path, spec()) as writer:
+        for arm in ARMS:
+            writer.append(block(arm, range(0)))
+        writer.commit()
+        growing = cli("info", path)
+        assert "full in" in growing.out
+        assert "acquire recover" not in growing.out
+        assert cli("info", path, "--json").json["written"] is True
+        assert "not sealed" not in cli("ls", tmp_path).out
+    left = cli("info", path)  # closed without a seal, as by a kill
+    assert "recording, no condition yet; no process writes it any more: acquire recover" in left.out
+    assert "full in" not in left.out
+    assert cli("info", path, "--json").json["disk"] is None
+    assert "recording, not sealed" in cli("ls", tmp_path).out
+    assert cli("recover", path).code == 0
+    assert "acquire recover" not in cli("info", path).out
+
+
+def test_a_code_without_a_seed_is_shown_without_one(cli: Cli, recording: Path) -> None:
+    """Recordings of format 1 call the register's state the seed, and a rig may give that state itself."""
+    root = recording / "zarr.json"
+    document = json.loads(root.read_bytes())
+    attributes = document["attributes"]
+    attributes["format"] = "acquire-recording/1"
+    attributes["code"]["seed"] = attributes["code"].pop("state")
+    root.write_text(json.dumps(document))
+    (shown,) = [line for line in cli("info", recording).out.splitlines() if line.lstrip().startswith("code")]
+    assert "state 0x4d" in shown
+    assert "None" not in cli("info", recording).out
+
+
 def test_cut_is_the_segment(cli: Cli, recording: Path, tmp_path: Path) -> None:
     out = tmp_path / "cut.npz"
     answer = cli("cut", recording, "--first-line", 110, "--lines", 20, "--out", out, "--json")

@@ -25,7 +25,15 @@ from acquire.daemon.messages import ErrorMessage, http_status
 from acquire.daemon.service import Service
 from acquire.daemon.states import State
 from acquire.daemon.stream import MOST_STREAMS
-from acquire.errors import AcquireError, CameraError, DeviceError, NoDaemonError, StateError, UsageError
+from acquire.errors import (
+    AcquireError,
+    BusyError,
+    CameraError,
+    DeviceError,
+    NoDaemonError,
+    StateError,
+    UsageError,
+)
 
 
 def test_commands(daemon: Client, run: FakeRun, tmp_path: Path) -> None:
@@ -393,5 +401,5 @@ def test_commands_that_wait_are_bounded(path: Path, run: FakeRun, monkeypatch: p
             daemon._devices.shutdown()
             return [one.exception() for one in arming]
 
-    found = [str(error) for error in asyncio.run(crowd())]
-    assert sum("commands are waiting already" in text for text in found) == 2
+    refused = [error for error in asyncio.run(crowd()) if "commands are waiting already" in str(error)]
+    assert [http_status(error) for error in refused if isinstance(error, BusyError)] == [503, 503]

@@ -4,15 +4,19 @@ from __future__ import annotations
 
 import errno
 import json
+import os
 import resource
+import shutil
 import socket
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
+import typer
 from fake_run import rig_config
 
+import acquire
 from acquire.config import RigConfig
 from acquire.daemon import doctor
 from acquire.daemon.doctor import Finding, examine
@@ -116,3 +120,26 @@ def test_the_command_opens_the_devices_and_ends_with_5_for_what_is_bad(tmp_path:
     assert {"trigger", "camera a", "camera b"} <= set(names)
     assert names["trigger"] == "good"
     assert ended.returncode == (5 if "bad" in names.values() else 0)
+
+
+def test_commands_say_that_the_package_has_lost_its_files(tmp_path: Path) -> None:
+    """Removing PyPI's acquire-imaging, which was installed over ours, takes `acquire/__init__.py` along."""
+    package, libraries = Path(acquire.__file__).parent, Path(typer.__file__).parents[1]
+    shutil.copytree(package, tmp_path / "acquire", ignore=shutil.ignore_patterns("*.pyc"))
+    (tmp_path / "acquire" / "__init__.py").unlink()
+    # As the installed command; -S: without what this environment adds to the path, such as the checkout.
+    command = [sys.executable, "-S", "-c", "import sys; from acquire.cli import main; sys.exit(main())"]
+    for word in ("--version", "status", "--help"):
+        ended = subprocess.run(
+            [*command, word],
+            cwd=tmp_path,
+            capture_output=True,
+            text=True,
+            check=False,
+            timeout=300,
+            env=os.environ | {"PYTHONPATH": f"{tmp_path}{os.pathsep}{libraries}"},
+        )
+        assert ended.returncode == 1
+        assert "Traceback" not in ended.stderr
+        assert "the installation is incomplete: acquire/__init__.py is missing" in ended.stderr
+        assert "pip install --force-reinstall --no-deps tdi-acquire" in ended.stderr

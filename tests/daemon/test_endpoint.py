@@ -57,6 +57,31 @@ def test_a_daemon_whose_socket_was_removed_is_named(path: Path) -> None:
             Endpoint(path)
 
 
+def test_names_that_were_removed_are_made_again(path: Path) -> None:
+    with contextlib.closing(Endpoint(path)) as endpoint:
+        assert endpoint.renewed() is None
+        for names in ([path], [lock_path(path)], [path, lock_path(path)]):
+            before = endpoint.socket
+            for name in names:
+                name.unlink()
+            if endpoint.renewed() is not None:
+                before.close()
+            with socket.socket(socket.AF_UNIX) as client:
+                client.connect(str(path))
+            with pytest.raises(StateError, match=f"process {os.getpid()}"):
+                Endpoint(path)
+        assert stat.S_IMODE(path.stat().st_mode) == 0o600
+
+
+def test_what_took_the_place_of_the_socket_stays(path: Path) -> None:
+    with contextlib.closing(Endpoint(path)) as endpoint:
+        path.unlink()
+        path.write_text("precious")
+        with pytest.raises(UsageError, match="something else is there now, and is left untouched"):
+            endpoint.renewed()
+    assert path.read_text() == "precious"
+
+
 def test_left_behind_by_a_killed_process(path: Path) -> None:
     code = (
         "import os, signal, sys, pathlib; from acquire.daemon.endpoint import Endpoint;"

@@ -15,9 +15,10 @@ from waiting import until
 
 from acquire.capacity.load import Load, recording_spec, trigger_run
 from acquire.clock import ClockFit
-from acquire.daemon.journal import Journal
+from acquire.daemon.journal import Journal, only_user
 from acquire.daemon.messages import RecoveryStatus
 from acquire.daemon.salvage import MOST_ODD, Salvage
+from acquire.errors import StateError, UsageError
 from acquire.lines import ARMS, LineBlock
 from acquire.store import RecordingWriter, RunCondition, open_recording
 from acquire.store.files import locked
@@ -261,6 +262,22 @@ def test_what_is_recorded_elsewhere_is_known_to_the_next_daemon(tmp_path: Path) 
         assert paths[3].is_dir()
     finally:
         following.close()
+
+
+def test_the_lists_of_a_rig_have_one_user(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    tmp_path.chmod(0o770)
+    with only_user(tmp_path, "rig"), only_user(tmp_path, "other"):
+        with pytest.raises(StateError, match=f"process {os.getpid()}"), only_user(tmp_path, "rig"):
+            pass
+        # Of whoever may write to the directory, any may run the next daemon.
+        assert (tmp_path / ".recordings-rig.lock").stat().st_mode & 0o777 == 0o660
+    with only_user(tmp_path, "rig"):
+        pass
+    (tmp_path / ".recordings-odd.lock").write_text("a text that is longer than any number of a process")
+    with pytest.raises(UsageError, match="it is not a lock of acquire"), only_user(tmp_path, "odd"):
+        pass
+    with only_user(tmp_path / "away", "rig"):  # a disk on which nothing can be made stops nothing else
+        assert "would not be noticed" in caplog.text
 
 
 @pytest.mark.parametrize("text", ["[" * 100_000, '{"not_sealed": 5}', '{"not_sealed": [1, "x", null]}', "\0"])

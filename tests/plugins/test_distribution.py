@@ -71,6 +71,8 @@ def acquire(target: Path, tmp_path: Path) -> Run:
     (tmp_path / "rig.toml").write_text(RIG.format(driver=""))
     (tmp_path / "stars.toml").write_text(SCENE.format(more=""))
 
+    searched = os.pathsep.join(filter(None, [str(target), os.environ.get("PYTHONPATH")]))
+
     def run(*words: str, program: tuple[str, ...] = ("-m", "acquire")) -> subprocess.CompletedProcess[str]:
         return subprocess.run(
             [sys.executable, *program, *words],
@@ -79,7 +81,7 @@ def acquire(target: Path, tmp_path: Path) -> Run:
             text=True,
             timeout=300,
             cwd=tmp_path,
-            env=os.environ | {"PYTHONPATH": str(target)},
+            env=os.environ | {"PYTHONPATH": searched},
         )
 
     return run
@@ -158,12 +160,21 @@ def test_its_scene_with_its_effect_is_simulated_and_solved_by_its_solver(
     attrs = json.loads((tmp_path / "run.zarr/zarr.json").read_text())["attributes"]
     assert [effect["kind"] for effect in attrs["effects"]] == ["flicker", "read_noise"]
     assert (attrs["scene"]["kind"], attrs["scene"]["fastest_hz"]) == ("stars", 2000.0)
+    used = [("scene", "stars"), ("effect", "flicker")]
+    theirs = {"distribution": "lab-extras", "version": "0.3"}
+    assert attrs["plugins"] == [{"kind": kind, "name": name, **theirs} for kind, name in used]
+    assert (
+        "scene stars of lab-extras 0.3, effect flicker of lab-extras 0.3"
+        in acquire("info", "run.zarr").stdout
+    )
     words = "run.zarr --out video.zarr --nm 1 --tm 4 --lines 60 --workers 1 --json --solver least-squares"
     solved = acquire("reconstruct", *words.split(), "--set", "ridge=0.002", "--iterations", "60")
     assert solved.returncode == 0, solved.stderr
     facts = json.loads(solved.stdout)
     assert (facts["solver"], facts["solver_options"]) == ("least-squares", {"ridge": 0.002})
     assert facts["quality"]["misfit"] < 0.2
+    provenance = json.loads((tmp_path / "video.zarr/zarr.json").read_text())["attributes"]["provenance"]
+    assert provenance["plugins"] == [{"kind": "solver", "name": "least-squares", **theirs}]
     recording = open_recording(tmp_path / "run.zarr")  # here, where nothing of theirs is installed
     assert recording.cut(0, 100).mask.all()
     with pytest.raises(ConfigError, match=r"run\.zarr, as it was recorded: .*\n.*scene 'stars' is not known"):

@@ -173,3 +173,23 @@ def test_a_checkout_that_is_newer_than_its_installation_says_so(
     plugins.forget()
     with pytest.raises(ConfigError, match=r"pip install -e \. --no-deps in .*pyproject.toml is newer"):
         EFFECTS.load("shot_noise")
+
+
+def test_fields_that_no_file_can_fill_are_named_with_what_to_write(install: Install, tmp_path: Path) -> None:
+    """pydantic said "Input should be a valid list" of a list, and "an instance of Path" of a path."""
+    fields = "levels: list[float] = []\n    names: set[str] = set()\n    file: Path = Path()\n"
+    source = GLOW.replace(
+        "level: float = 1.0\n", f"level: float = 1.0\n    {fields}    two: tuple[int, ...] = ()\n"
+    )
+    install("lab-light", {"glow": "lab_light:Glow"}, f"from pathlib import Path\n{source}")
+    table = 'kind = "glow"\nlevels = [1.0]\nnames = ["a"]\nfile = "x.png"\ntwo = 2'
+    with pytest.raises(ConfigError) as refused:
+        load_scene(scene(tmp_path, table))
+    found = [line.strip().removeprefix("effects.0.") for line in str(refused.value).splitlines()[1:]]
+    asks, be = "the plug-in asks for a", "which no file can hold; its field should be"
+    assert found == [
+        f"levels = [1.0]: {asks} list, {be} a tuple",
+        f"names = ['a']: {asks} set, {be} a tuple",
+        f"file = 'x.png': {asks} Path, {be} acquire.config.base.FilePath",
+        "two = 2: a list is expected",
+    ]

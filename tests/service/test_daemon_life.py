@@ -13,6 +13,7 @@ from live_daemon import LINE_RATE_HZ, SUBSTEPS, Daemon, acquire
 from waiting import until
 
 from acquire.config import load_rig
+from acquire.daemon.endpoint import lock_path
 from acquire.daemon.states import SEALED, State
 from acquire.errors import UsageError
 from acquire.store import open_recording
@@ -192,6 +193,34 @@ def test_second_daemon_is_refused(daemon: Daemon) -> None:
     assert daemon.socket.stat().st_ino == socket_inode
     with daemon.client() as client:
         assert client.status().pid == daemon.process.pid
+
+
+def test_second_daemon_of_the_rig_is_refused_on_another_socket(daemon: Daemon) -> None:
+    """Both kept their lists of open recordings in one file, and each overwrote the other's."""
+    answer = acquire("serve", "--config", daemon.config, "--socket", daemon.home / "second.sock")
+    assert answer.code == 4
+    assert f"another daemon (process {daemon.process.pid}) of a rig named small records into" in answer.err
+    assert "--set name=NAME" in answer.err
+    assert not (daemon.home / "second.sock").exists()
+
+
+@pytest.mark.parametrize("what", ["socket", "socket and lock"])
+def test_a_socket_that_is_removed_comes_back(daemon: Daemon, what: str) -> None:
+    """What empties /tmp or XDG_RUNTIME_DIR made a daemon unreachable until it was restarted."""
+    with daemon.client() as client:
+        follower = client.events(history=True, timeout_s=60)
+        before = next(follower)  # by a connection that exists, and goes on
+        daemon.socket.unlink()
+        if "lock" in what:
+            lock_path(daemon.socket).unlink()
+        until(daemon.socket.exists, limit_s=30)
+        assert daemon("status").code == 0
+        told = next(news for news in follower if news.kind == "trouble")
+        assert told.id.partition("-")[0] == before.id.partition("-")[0]
+        assert "was removed by another program, and is made again" in told.text
+        assert client.status().pid == daemon.process.pid
+    refused = acquire("serve", "--config", daemon.config)
+    assert (refused.code, f"process {daemon.process.pid}" in refused.err) == (4, True)
 
 
 def test_socket_is_private(daemon: Daemon) -> None:

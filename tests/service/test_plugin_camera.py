@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from live_daemon import Daemon
+from live_daemon import Daemon, acquire
 from packed import install
 
 from acquire.store import open_recording
@@ -39,3 +39,7 @@ def test_lines_of_a_driver_that_was_installed_are_recorded(
         line = np.asarray(camera.line_number).astype(np.int64)[:, None]
         expected = (step * line + np.arange(8)) % 4095
         np.testing.assert_array_equal(np.asarray(camera.lines), expected)
+    extras = {"distribution": "lab-extras", "version": "0.3"}
+    used = [("camera driver", "ramp"), ("trigger driver", "slow-link")]
+    assert recording.attrs["plugins"] == [{"kind": kind, "name": name, **extras} for kind, name in used]
+    assert "camera driver ramp of lab-extras 0.3" in acquire("info", tmp_path / "ramp.zarr").out

@@ -2,9 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
+import os
+import subprocess
+import sys
 from pathlib import Path
 
 from acquire.lines import ARMS
+from tools.shift_host import left_in_shared_memory, mapped
 from tools.soak import Soak, soak
 from tools.weeks import Life
 
@@ -45,3 +50,23 @@ def test_what_1000_recordings_add_is_a_slope_of_the_second_half() -> None:
     assert abs(slopes["memory_mb"]) < 0.1
     assert abs(slopes["objects"] - 2000) < 1
     assert slopes["descriptors"] == 0
+
+
+def test_shared_memory_of_other_programs_is_not_counted(tmp_path: Path) -> None:
+    """Semaphores that other tests made and left in the meantime counted as ours."""
+    code = "import mmap; f = open({!r}, 'r+b'); m = mmap.mmap(f.fileno(), 1); print(flush=True); input()"
+    with contextlib.ExitStack() as stack:
+        users = []
+        for whose in ("ours", "another"):
+            file = Path(f"/dev/shm/sem.{tmp_path.parent.parent.name}-{os.getpid()}-{whose}")
+            stack.callback(file.unlink, missing_ok=True)
+            file.write_bytes(b"x")
+            command = [sys.executable, "-c", code.format(str(file))]
+            user = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE)
+            users.append(stack.enter_context(user))
+            assert user.stdout is not None
+            user.stdout.readline()
+        found = mapped([users[0].pid])
+        for user in users:
+            user.kill()
+        assert [name.rpartition("-")[2] for name in left_in_shared_memory(found)] == ["ours"]

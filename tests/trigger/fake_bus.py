@@ -23,6 +23,8 @@ class FakeBus(usb.backend.IBackend):
     def __init__(self, twin, product: int = PRODUCT) -> None:
         self.twin, self.product, self.gone, self.claimed = twin, product, False, 0
         self.refusal: int | None = None
+        self.open = 0
+        """Number of handles."""
         self.rest = b""
 
     def unplug(self) -> None:
@@ -82,10 +84,11 @@ class FakeBus(usb.backend.IBackend):
 
     def open_device(self, dev):
         self._refuse(errno.EACCES)
+        self.open += 1
         return dev
 
     def close_device(self, dev_handle):
-        """Nothing."""
+        self.open -= 1
 
     def get_configuration(self, dev_handle):
         return 1

@@ -34,7 +34,8 @@ def test_the_driver_runs_over_usb_and_reports_an_unplugged_cable() -> None:
 def test_a_missing_usb_device_is_reported_with_those_present() -> None:
     with wired_model() as model:
         with pytest.raises(TriggerError, match="usb 1209:0001 7 is not on the bus; possible: 42"):
-            UsbTransport(serial="7", backend=FakeBus(model))
+            UsbTransport(serial="7", backend=(bus := FakeBus(model)))
+        assert bus.open == 0
         with pytest.raises(TriggerError, match="no device of this kind"):
             UsbTransport(backend=FakeBus(model, product=2))
         UsbTransport(backend=FakeBus(model)).close()
@@ -50,7 +51,9 @@ def test_a_device_without_permission_suggests_a_remedy(refusal, hint) -> None:
         with pytest.raises(TriggerError, match=f"usb 1209:0001 cannot be opened: .*try: .*{hint}"):
             UsbTransport(backend=bus)
         bus.refusal = None
+        assert bus.open == 0  # the handle of a device that could not be claimed stayed open
         UsbTransport(backend=bus).close()  # the lock was let go
+        assert bus.open == 0
 
 
 def test_triggers_on_the_bus_are_listed_with_obstacles(monkeypatch) -> None:

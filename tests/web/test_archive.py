@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import asyncio
+import contextlib
 import os
 import shutil
 from pathlib import Path
@@ -25,6 +27,7 @@ from acquire.store import (
 from acquire.stream.tagger import Tagger
 from acquire.trigger.base import TriggerRun
 from acquire.web import archive as archive_module
+from acquire.web.app import Reading, _prepare
 from acquire.web.archive import LINES_PER_ROW, LOST_COLOUR, PICTURE_ROWS, Archive, _arm_overview
 
 CLOCK = ClockFit(90_000_000, 0, 0)
@@ -57,6 +60,17 @@ def test_damaged_and_missing_lines_are_shown_as_lost_and_told(tmp_path: Path) ->
         assert (np.delete(picture, (1, 2), axis=0) == 51).all()
     (listed,) = Archive(tmp_path).recordings()
     assert listed.tainted_by == ["arm b: 7 lines that arrived damaged", "tag mismatches: 2"]
+
+
+def test_the_first_list_is_made_before_anybody_asks(tmp_path: Path) -> None:
+    """Of 500 recordings, it takes seconds."""
+    with RecordingWriter.create(tmp_path / "run.zarr", recording_spec(LOAD, CLOCK)) as writer:
+        writer.seal(RunCondition.GOOD, "stopped", {})
+    known, absent = Archive(tmp_path), Archive(tmp_path / "absent")
+    with contextlib.closing(Reading()) as reading:
+        asyncio.run(_prepare(known, reading))
+        asyncio.run(_prepare(absent, reading))  # whoever asks for that list is told
+    assert set(known._facts) == {"run.zarr"}
 
 
 def test_a_new_video_under_an_old_name_has_a_range_of_its_own(tmp_path: Path) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import json
 import stat
 import subprocess
@@ -19,7 +20,9 @@ from starlette.routing import Route
 
 from acquire.config import load_rig
 from acquire.config.web import WebConfig
+from acquire.daemon.control import new_app
 from acquire.errors import ConfigError, PlaceError, UsageError
+from acquire.web import app as app_module
 from acquire.web import guard as guard_module
 from acquire.web import tokens as tokens_module
 from acquire.web.archive import Archive
@@ -96,6 +99,33 @@ def test_requests_of_one_address_are_bounded(monkeypatch: pytest.MonkeyPatch) ->
     monkeypatch.setattr(guard_module, "ADMITTED", (4.0, 0.0))
     codes = [one.status_code for one in ask("GET", "/", *[{}] * 5, *[OPERATOR] * 5)]
     assert codes == [200, 200, 200, 429, 429, 200, 200, 200, 200, 429]  # a stranger's flood keeps nobody out
+
+
+def test_a_full_queue_of_readers_asks_to_come_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It was answered as if the request were wrong (422)."""
+    monkeypatch.setattr(app_module, "MOST_READING", 2)
+
+    reading, page = app_module.Reading(), new_app("a list that waits for the disk")
+
+    @page.get("/list")
+    async def _() -> list[str]:
+        return await reading(lambda: [path.name for path in tmp_path.iterdir()])
+
+    async def crowd() -> list[httpx.Response]:
+        transport = httpx.ASGITransport(page)
+        async with httpx.AsyncClient(transport=transport, base_url="http://page") as client:
+            return [
+                *await asyncio.gather(*[client.get("/list") for _ in range(5)]),
+                await client.get("/list"),
+            ]
+
+    with contextlib.closing(reading):
+        *found, later = asyncio.run(crowd())
+    assert sorted(one.status_code for one in found) == [200, 200, 503, 503, 503]
+    refused = next(one for one in found if one.status_code == 503)
+    assert refused.headers["retry-after"] == "1"
+    assert (refused.json()["error"], refused.json()["exit_code"]) == ("BusyError", 4)
+    assert later.status_code == 200
 
 
 def test_buckets_fill_again_and_are_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -204,6 +234,8 @@ def test_tokens_that_others_can_read_are_refused(tmp_path: Path) -> None:
     ("settings", "words"),
     [
         ({"host": "0.0.0.0"}, "can be reached from other hosts"),
+        ({"host": ""}, r"web\.host = '': not an address; possible: 127\.0\.0\.1, or 0\.0\.0\.0 for every"),
+        ({"host": "a b"}, "web.host = 'a b': not an address"),
         ({"certificate": "c.pem"}, "must be given together"),
         ({"port": 99999}, "less than or equal to 65535"),
     ],

@@ -69,18 +69,19 @@ class UsbTransport:
         self.name = f"usb {vendor:04x}:{product:04x}{' ' + serial if serial else ''}"
         self.bytes_per_s = float("inf")
         self._lock = PortLock(self.name)
+        self._device: Any = None
         try:
             self._device = self._find(vendor, product, serial, backend)
             self._in, self._out = self._claim()
         except (usb.core.USBError, NotImplementedError, ValueError) as error:
             # pyusb: no backend is a ValueError, a call that this host's libusb lacks NotImplementedError
-            self._lock.release()
+            self.close()
             hint = _HINTS.get(getattr(error, "errno", None) or 0, "check cable and power")
             if isinstance(error, usb.core.NoBackendError):
                 hint = "install libusb-1.0"
             raise TriggerError(f"{self.name} cannot be opened: {error}", hint=hint) from error
         except TriggerError:
-            self._lock.release()
+            self.close()
             raise
 
     def read(self) -> bytes:
@@ -103,7 +104,9 @@ class UsbTransport:
             raise TriggerError(f"{self.name} took {sent} of {len(data)} bytes")
 
     def close(self) -> None:
-        usb.util.dispose_resources(self._device)
+        # Also a device that was opened and could not be claimed: its handle would stay.
+        if self._device is not None:
+            usb.util.dispose_resources(self._device)
         self._lock.release()  # last: whoever gets it finds the interface free
 
     def _find(self, vendor: int, product: int, serial: str, backend: Any) -> Any:
@@ -111,7 +114,12 @@ class UsbTransport:
         found = list(usb.core.find(find_all=True, idVendor=vendor, idProduct=product, backend=backend) or ())
         if found and not serial:
             return found[0]
-        devices = {str(device.serial_number or ""): device for device in found}
+        devices = {}
+        for device in found:
+            number = str(device.serial_number or "")
+            devices[number] = device
+            if number != serial:
+                usb.util.dispose_resources(device)  # reading its number has opened it
         if serial in devices:
             return devices[serial]
         raise TriggerError(
