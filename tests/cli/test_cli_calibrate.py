@@ -156,3 +156,10 @@ def test_one_of_another_instrument_is_refused(cli: Cli, taken: dict[str, Path], 
     answer = cli("reconstruct", other, "--out", tmp_path / "v.zarr", "--calibration", tmp_path / "no.zarr")
     assert answer.code == 2
     assert cli("calibrate", "show", other).code == 2
+
+
+def test_what_is_no_calibration_is_not_called_no_recording(cli: Cli, tmp_path: Path) -> None:
+    (tmp_path / "cal.zarr").mkdir()
+    answer = cli("calibrate", "show", tmp_path / "cal.zarr")
+    assert answer.code == 2
+    assert "is not a calibration: it holds no zarr.json" in answer.err
