@@ -216,7 +216,7 @@ def test_values_that_are_lost_on_the_disk_are_not_zeros(
     """Zarr fills in for a chunk that is missing: offsets were 0 DN, without a word."""
     save_calibration(tmp_path / "cal.zarr", known)
     (tmp_path / "cal.zarr" / name / "c" / "0" / "0").unlink()
-    with pytest.raises(DataError, match="offset_dn of shape|uncertainties of gain"):
+    with pytest.raises(DataError, match=r"offset_dn of shape|uncertainties of gain"):
         open_calibration(tmp_path / "cal.zarr")
 
 
