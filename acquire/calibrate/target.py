@@ -126,6 +126,7 @@ def alignment(exposure: Exposure, known: Calibration) -> Finding:
         "brightness": round(match.brightness, 5),
         "shading_of_flat": known.steps["flat"].get("made") if shading else None,
         "dimmed": match.fall_off.in_b,
+        "fall_off": match.fall_off.facts(),
         "corrected": _corrected(known, quantities),
     }
     warnings = []

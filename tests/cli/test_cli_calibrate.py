@@ -52,7 +52,7 @@ def test_step_by_step_to_a_page(cli: Cli, taken: dict[str, Path], tmp_path: Path
     assert cli("calibrate", "show", cal, "--json").json["orientation"] == "turn 90"
     answer = cli("calibrate", "check", cal, taken["target"])
     assert answer.code == 0, answer.err
-    assert answer.out.count("holds") == 5
+    assert answer.out.count("holds") == 6
 
 
 def test_a_failed_check_names_what_has_changed(cli: Cli, taken: dict[str, Path], tmp_path: Path) -> None:
