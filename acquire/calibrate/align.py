@@ -75,6 +75,11 @@ class FallOff:
         least = min(float(falling(pair, x).min()) for pair in ((r1, r2), (c1, c2)))
         return f"the arms' images differ in the light on the field, by up to {1 - least:.0%} towards a side"
 
+    def facts(self) -> dict[str, list[float]]:
+        """Return the terms and their uncertainties as JSON."""
+        values = {"terms": self.terms, "uncertainty": self.errors}
+        return {name: [round(float(each), 6) for each in row] for name, row in values.items()}
+
     @property
     def _clear(self) -> NDArray[np.bool_]:
         return np.asarray(np.abs(self.terms) > np.maximum(LEAST_FALL, FALL_SURE * self.errors))

@@ -22,6 +22,7 @@ from acquire.noise import Noise
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
+    from acquire.calibrate.calibration import AlignmentFound
     from acquire.lines import Segment
     from acquire.store import Recording
 
@@ -98,11 +99,14 @@ def calibrated(segment: Segment, calibration: Calibration) -> Segment:
         responsivity = _columns(segment.responsivity_dn, segment)
         responsivity = responsivity if gain is None else responsivity * gain
         responsivity = responsivity if balance is None else responsivity * balance[:, None]
+    optics, veil = blur_of(calibration), veil_of(calibration)
+    if veil is not None:
+        optics = replace(optics or SHARP, veil=veil)
     known = {
         "curve": curve,
         "black_level_dn": black,
         "responsivity_dn": responsivity,
-        "blur": blur_of(calibration),
+        "blur": optics,
         "noise": _noise(calibration),
     }
     changes: dict[str, Any] = {name: value for name, value in known.items() if value is not None}
@@ -115,14 +119,15 @@ def calibrated(segment: Segment, calibration: Calibration) -> Segment:
     corrected = replace(segment, **changes)
     if calibration.orientation is not None:
         corrected = oriented(corrected, view_named(calibration.orientation))
-    if calibration.alignment is not None:
-        # measured between the arms as they are turned by then
-        corrected = replace(corrected, alignment=calibration.alignment.alignment)
-    if (veil := veil_of(calibration)) is not None:
-        corrected = replace(corrected, blur=replace(corrected.blur or SHARP, veil=veil))
     if belongs_to_flat(calibration):
         corrected = shaded(corrected, calibration.quantities["shading"].value)
-    return _without_interpolation(corrected)
+    # measured between the arms as they are turned by then
+    return aligned(corrected, calibration.alignment)
+
+
+def aligned(segment: Segment, found: AlignmentFound | None) -> Segment:
+    """Return the segment with arm B's alignment, if there is one."""
+    return segment if found is None else _without_interpolation(replace(segment, alignment=found.alignment))
 
 
 def belongs_to_flat(calibration: Calibration) -> bool:

@@ -97,6 +97,10 @@ FOUND_BY = {
     "veil": ("veil",),
 }
 """Step → the quantities that it measures."""
+NOT_ALWAYS = ("full_well_e", "excess_dn")
+"""Those of them that a step may leave open."""
+ABOVE_ZERO = ("gain", "balance", "dn_per_electron")
+"""Quantities that lines are divided by."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -222,6 +226,14 @@ class Calibration:
                     f"{name} of shape {measured.value.shape} does not fit the calibration, or is not finite",
                     possible=f"finite numbers {shape}",
                 )
+            # "not all", which is also true of NaN
+            if not (measured.uncertainty >= 0).all():
+                raise UsageError(f"the uncertainties of {name} are not numbers", possible="0 or more")
+            if name in ABOVE_ZERO and not (measured.value > 0).all():
+                raise UsageError(
+                    f"{name} of the calibration is not above 0: it is {measured.value.min():.3g}",
+                    possible="numbers above 0",
+                )
 
     def value(self, name: str) -> NDArray[np.float64] | None:
         """Return the values of a quantity, or None if it was not measured."""
@@ -317,6 +329,7 @@ class Calibration:
                     name: Measured(np.asarray(each["value"], float), np.asarray(each["uncertainty"], float))
                     for name, each in attrs["quantities"].items()
                 }
+            _check_complete(attrs["steps"], quantities)
             usable, found = attrs["usable"], attrs["alignment"]
             return cls(
                 instrument=Instrument.model_validate(attrs["instrument"]),
@@ -334,7 +347,8 @@ class Calibration:
                 ),
             )
         except (LookupError, TypeError, ValueError, AttributeError, ValidationError, UsageError) as error:
-            raise DataError(f"the calibration is damaged: {error}", hint="measure it again") from error
+            why = error.message if isinstance(error, UsageError) else error
+            raise DataError(f"the calibration is damaged: {why}", hint="measure it again") from error
 
 
 def unusable_columns(usable: NDArray[np.bool_]) -> dict[str, list[int]]:
@@ -352,6 +366,13 @@ def _usable(steps: Mapping[str, dict[str, Any]], columns: int) -> NDArray[np.boo
         for row, arm in zip(usable, ARMS, strict=True):
             row[each.get(arm, [])] = False
     return usable
+
+
+def _check_complete(steps: Mapping[str, Any], quantities: Mapping[str, Measured]) -> None:
+    for step, names in FOUND_BY.items():
+        lost = [each for each in names if each not in (*quantities, *NOT_ALWAYS)]
+        if step in steps and lost:
+            raise ValueError(f"{lost[0]}, which its step {step} measured, is missing")
 
 
 def _step(attrs: Mapping[str, Any]) -> dict[str, Any]:

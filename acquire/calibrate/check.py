@@ -8,20 +8,24 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from acquire.calibrate.apply import check_fits
+from acquire.calibrate.calibration import Finding, Measured
 from acquire.calibrate.columns import dark, flat
 from acquire.calibrate.field import field_edge
 from acquire.calibrate.psf import psf
 from acquire.calibrate.target import alignment, orientation
 from acquire.errors import UsageError
+from acquire.lines import ARMS
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
     from numpy.typing import NDArray
 
-    from acquire.calibrate.calibration import Calibration, Finding
+    from acquire.calibrate.calibration import Calibration
     from acquire.calibrate.exposure import Exposure
 
+QUARTIC, FEWEST_COLUMNS = 5, 12
+"""Terms of the fall of the light over an arm's columns, and how many of these determine it."""
 SURE = 5.0
 """Standard uncertainties from which a difference is significant."""
 MATTERS = {
@@ -31,6 +35,7 @@ MATTERS = {
     "pixels": 0.15,
     "turn_deg": 0.1,
     "blur_px": 0.15,
+    "light": 0.01,
 }
 """Changes that a reconstruction notices; smaller ones leave a calibration true, however certain they are."""
 
@@ -86,7 +91,8 @@ def check(exposure: Exposure, known: Calibration, *, covered: bool = False) -> C
             dimmed = bool(known.steps.get("align", {}).get("dimmed", "shading" in known.quantities))
             edge = field_edge(known.with_step(found), known.alignment.alignment, dimmed=dimmed)
             corrected = replace(found, quantities={**found.quantities, **edge.quantities})
-        compared = list(_columns(corrected, known, "gain", "1"))
+        light, corrected = _light_of_flat(corrected, known)
+        compared = [*_columns(corrected, known, "gain", "1"), *light]
         # The flats themselves, since an alignment may have corrected the balance of the calibration.
         before = known.steps.get("flat", {}).get("part_a")
         if before is not None:
@@ -111,7 +117,8 @@ def check(exposure: Exposure, known: Calibration, *, covered: bool = False) -> C
         result = "is not clear" if found.orientation is None else f"is {found.orientation!r}"
         doubt = f"the orientation {result}; the calibration has {expected!r}"
         return Check(blur, (*doubts, doubt), same_view=found.orientation is None)
-    return Check((*_alignment(alignment(exposure, known), known), *blur), doubts)
+    aligned = alignment(exposure, known)
+    return Check((*_alignment(aligned, known), *_light_of_target(aligned, known), *blur), doubts)
 
 
 def _columns(found: Finding, known: Calibration, name: str, unit: str) -> Iterator[Compared]:
@@ -128,6 +135,70 @@ def _columns(found: Finding, known: Calibration, name: str, unit: str) -> Iterat
     limit = np.maximum(MATTERS[name], SURE * sure)
     at = np.unravel_index((np.abs(change) - limit).argmax(), change.shape)
     yield Compared(name, unit, float(change[at]), float(sure[at]), MATTERS[name])
+
+
+def _light_of_flat(found: Finding, known: Calibration) -> tuple[list[Compared], Finding]:
+    """Compare the fall of the light over the columns; return the flat without a change of it that counts.
+
+    A lens, or a lamp, changes the gains smoothly, and is not a change of the columns.
+    """
+    if "gain" not in known.quantities:
+        return [], found
+    before, now = known.quantities["gain"], found.quantities["gain"]
+    x, rest = np.linspace(-1, 1, before.value.shape[1]), now.value.copy()
+    changes = []
+    for arm, name in enumerate(ARMS):
+        # a gain of 1 is assumed where the optics hide the column
+        good = (before.value[arm] != 1.0) & (now.value[arm] != 1.0)
+        good &= np.isin(np.arange(len(x)), _hidden(known, name) + _hidden(found, name), invert=True)
+        good &= True if known.usable is None else known.usable[arm]
+        if good.sum() <= FEWEST_COLUMNS:
+            return [], found
+        # the quotient of two parabolas, which is not one itself
+        design = np.vander(x, QUARTIC, increasing=True)
+        ratio = now.value[arm, good] / before.value[arm, good]
+        terms = np.linalg.lstsq(design[good], ratio, rcond=None)[0]
+        profile = design @ terms
+        spread = float(np.square(ratio - profile[good]).sum()) / (good.sum() - QUARTIC)
+        errors = np.sqrt(np.diag(design @ np.linalg.inv(design[good].T @ design[good]) @ design.T) * spread)
+        ends = profile[[0, -1]] / profile[len(x) // 2] - 1
+        worst = int(np.abs(ends).argmax())
+        changes.append((float(ends[worst]), float(errors[[0, -1]][worst])))
+        rest[arm] /= np.where(good, profile, 1.0)
+    change, sure = max(changes, key=lambda each: abs(each[0]))
+    light = Compared("light towards a side, in the flat", "1", change, sure, MATTERS["light"])
+    if light.holds:
+        return [light], found
+    quantities = {**found.quantities, "gain": Measured(rest, now.uncertainty)}
+    return [light], replace(found, quantities=quantities)
+
+
+def _light_of_target(found: Finding, known: Calibration) -> Iterator[Compared]:
+    """Compare what the arms' images of a target show of the fall of the light: the differences of both.
+
+    Lenses, or lamps, that change alike in both arms are seen in a flat only.
+    """
+    before, now = known.steps.get("align", {}).get("fall_off"), found.facts["fall_off"]
+    if before is None or "gain" not in known.quantities:
+        return
+    change, doubt = (
+        np.subtract(now["terms"], before["terms"]),
+        np.hypot(now["uncertainty"], before["uncertainty"]),
+    )
+    # of A's rows, then of B's columns, at either side: t₂ ± t₁
+    sides = [
+        (change[i + 1] + sign * change[i], np.hypot(*doubt[i : i + 2])) for i in (0, 2) for sign in (-1, 1)
+    ]
+    largest, sure = max(sides, key=lambda each: abs(each[0]))
+    yield Compared(
+        "light towards a side, arm against arm", "1", float(largest), float(sure), MATTERS["light"]
+    )
+
+
+def _hidden(measured: Finding | Calibration, arm: str) -> list[int]:
+    """Return the columns of an arm whose gain the optics hid in the flat."""
+    facts = measured.facts if isinstance(measured, Finding) else measured.steps.get("flat", {})
+    return list(facts.get("optics_hide_columns", {}).get(arm, []))
 
 
 def _alignment(found: Finding, known: Calibration) -> Iterator[Compared]:

@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from acquire.errors import UsageError
+from acquire.lines import ARMS
+from acquire.noise import robust_sigma
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -21,6 +23,18 @@ DIMMEST, BRIGHTEST = 0.1, 0.9
 """Shares of the range below which a flat determines little, and above which noise may reach white."""
 DRIFT = 6.0
 LOWEST_LIGHT_DN = 8.0
+AMBIENT, BRIGHT_DARK = 0.05, 0.25
+"""Parts of the range above the camera's black level at which dark lines are doubtful, and at which a lens
+that is said to be covered is not."""
+BANDS, FOLLOWS, BY_CHANCE = 8, 0.1, 5.0
+"""Bands of rows whose code is fitted to dark lines, the part of a column's variance from which they follow
+it, and how many times as much as noise has by chance."""
+TEXTURE, UNEVEN = 0.1, 0.06
+"""Spread of a flat's columns about a smooth profile that no sensor has (1 to 3 % are usual), and the least
+range of that profile that is mentioned."""
+PROFILE_DEGREE = 4
+LEAST_COLUMNS = 16
+"""Fewer columns do not tell texture from a profile."""
 
 
 def offset_of(known: Calibration, step: str, *, with_ambient: bool = True) -> NDArray[np.float64]:
@@ -39,10 +53,93 @@ def refuse_coded(exposure: Exposure, step: str) -> None:
     """Raise UsageError for a light that is not steady."""
     if exposure.code_value != 1:
         raise UsageError(
-            f"{exposure.recording} does not have the steady light that {step} needs: its code is "
-            f"{exposure.recording.attrs['code']}",
-            possible="code.kind = 'constant', code.value = 1",
+            f"{exposure.recording} does not have the steady light that {step} needs: its light "
+            f"{exposure.light}",
+            possible="lines under code 1: code.kind = 'constant', code.value = 1",
+            hint="acquire arm --code steady, and record again",
         )
+
+
+def refuse_lit(exposure: Exposure, found: Moments, *, covered: bool) -> list[str]:
+    """Raise UsageError for dark lines that saw the light; return a warning if they may have."""
+    if exposure.code_value is None and _follow_code(exposure):
+        raise UsageError(
+            f"{exposure.recording} is not dark: its lines follow the light's code, and so the lens was open",
+            possible="a covered lens; or the light off: code.kind = 'constant', code.value = 0",
+            hint="cover the lens, or acquire arm --code dark, and record again",
+        )
+    above = np.median(found.mean, axis=1) - exposure.camera("black_level_dn")
+    share = float((above / exposure.camera("white_dn")).max())
+    if covered and share > BRIGHT_DARK:
+        raise UsageError(
+            f"{exposure.recording} is not dark: its lines are {share:.0%} of white above the black level, "
+            "and so the lens was open",
+            possible="a covered lens; or, if it was covered, black_level_dn in the rig file as in the camera",
+            hint="cover the lens, or correct black_level_dn, and record again",
+        )
+    if share <= AMBIENT:
+        return []
+    return [
+        f"the dark lines are {share:.0%} of white above the black level: ambient light takes this part of "
+        "the range and adds noise (switch it off or shield the lens, and record again), or black_level_dn in "
+        "the rig file is not the camera's"
+    ]
+
+
+def _follow_code(exposure: Exposure) -> bool:
+    """Return whether a column's lines follow the light's code: a band of lit rows adds its bits to a line.
+
+    Whatever the scene is, and wherever: each column is fitted by the sums of the bits of each of the bands.
+    """
+    samples, usable = next(exposure.samples())
+    segment = exposure.recording.cut(exposure.first_line, samples.shape[1])
+    starts = segment.geometry.substeps * np.arange(samples.shape[1])
+    ends = np.linspace(0, segment.geometry.size, BANDS + 1).astype(np.int64)
+    total = np.concatenate([[0.0], np.cumsum(segment.code, dtype=np.float64)])
+    bits = np.diff(total[starts[:, None] + ends], axis=1)
+    for lines, good in zip(samples, usable, strict=True):
+        arrived = good.any(axis=1)
+        if arrived.sum() <= BANDS:
+            continue
+        design, seen = (each - each.mean(axis=0) for each in (bits[arrived], lines[arrived].astype(float)))
+        fitted = design @ np.linalg.lstsq(design, seen, rcond=None)[0]
+        part = (fitted**2).sum(axis=0) / np.maximum((seen**2).sum(axis=0), 1e-9)
+        if part.max() > max(FOLLOWS, BY_CHANCE * BANDS / len(seen)):
+            return True
+    return False
+
+
+def refuse_texture(
+    exposure: Exposure, response: NDArray[np.float64], trusted: NDArray[np.bool_], *, smooth: bool
+) -> list[str]:
+    """Raise UsageError for a flat of a scene with texture; return a warning if its light is uneven.
+
+    Behind a fibre neighbouring columns differ as their fibres do, and nothing is claimed.
+    """
+    if exposure.recording.fibre is not None:
+        return []
+    warnings = []
+    x = np.linspace(-1, 1, response.shape[1])
+    for arm, row, good in zip(ARMS, response, trusted, strict=True):
+        if good.sum() < LEAST_COLUMNS:
+            continue
+        own = row[good] / np.median(row[good])
+        profile = np.polynomial.Chebyshev.fit(x[good], own, PROFILE_DEGREE, [-1, 1])(x[good])
+        rough, uneven = robust_sigma(own - profile), 1 - profile.min() / profile.max()
+        if rough > TEXTURE:
+            raise UsageError(
+                f"{exposure.recording} is not uniform: neighbouring columns of arm {arm} differ by "
+                f"{rough:.0%}, more than those of a sensor",
+                possible="a white scene without texture, larger than the field",
+                hint="put a white card in place of the target, and record again",
+            )
+        if uneven > UNEVEN and not smooth:
+            warnings.append(
+                f"the light falls smoothly by {uneven:.0%} over the columns of arm {arm}: by the lens, then "
+                "all is well, and align separates it; or by an uneven lamp or scene, then make it even, or "
+                "repeat flat with --smooth"
+            )
+    return warnings
 
 
 def refuse_clipped(exposure: Exposure, found: Moments) -> None:

@@ -17,6 +17,8 @@ from acquire.calibrate.checks import (
     refuse_clipped,
     refuse_coded,
     refuse_level,
+    refuse_lit,
+    refuse_texture,
     warn_of_drift,
     warn_of_exclusions,
     warn_of_later_corrections,
@@ -56,11 +58,13 @@ def dark(exposure: Exposure, *, covered: bool = False, progress: Progress = no_p
     """
     if exposure.code_value != 0 and not covered:
         raise UsageError(
-            f"{exposure.recording} is not dark: its light follows code {exposure.recording.attrs['code']}",
-            possible="code.kind = 'constant', code.value = 0; or a covered lens and --covered",
+            f"{exposure.recording} is not dark: its light {exposure.light}",
+            possible="lines under code 0: code.kind = 'constant', code.value = 0; or a covered lens",
+            hint="acquire arm --code dark, and record again; or --covered, if the lens was covered",
         )
     found = moments(exposure, progress)
     refuse_clipped(exposure, found)
+    lit = refuse_lit(exposure, found, covered=covered)
     noise = np.sqrt(found.variance)
     lines = found.lines[:, None]
     # Usable columns have a noise like most others.
@@ -76,7 +80,7 @@ def dark(exposure: Exposure, *, covered: bool = False, progress: Progress = no_p
         "noise_dn": Measured(noise, noise / np.sqrt(2 * lines)),
     }
     facts = {**exposure.facts(), "covered": covered}
-    warnings = (*warn_of_drift(found), *warn_of_exclusions(usable, "noise"))
+    warnings = (*lit, *warn_of_drift(found), *warn_of_exclusions(usable, "noise"))
     return Finding("dark", exposure.instrument, quantities, usable, facts=facts, warnings=warnings)
 
 
@@ -129,6 +133,7 @@ def flat(
             possible="a column that the dark has not excluded, with light",
             hint="acquire calibrate show",
         )
+    uneven = refuse_texture(exposure, response, trusted, smooth=smooth)
     level = np.array([row[good].mean() for row, good in zip(shape, trusted, strict=True)])[:, None]
     arms = np.array([row[good].mean() for row, good in zip(response, trusted, strict=True)])
     error = np.hypot(
@@ -161,6 +166,7 @@ def flat(
     }
     warnings = (
         *warn_of_level(exposure, light),
+        *uneven,
         *warn_of_drift(found),
         *warn_of_exclusions(usable | ~exposure.lit, "response"),
         *warn_of_later_corrections(known),

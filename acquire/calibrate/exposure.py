@@ -67,6 +67,11 @@ class Exposure:
         code = code_from_attrs(self.recording.attrs["code"])
         return code.value if isinstance(code, ConstantCode) else None
 
+    @property
+    def light(self) -> str:
+        """What the light did, in words."""
+        return {0: "was off (code 0)", 1: "was steady (code 1)", None: "blinked with a code"}[self.code_value]
+
     def camera(self, key: str) -> NDArray[np.float64]:
         """Return a number of each camera: (arm,)."""
         return np.array([float(self.recording.attrs["cameras"][arm][key]) for arm in ARMS])

@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import zarr
+from zarr.codecs import Crc32cCodec, ZstdCodec
 from zarr.errors import GroupNotFoundError
 
 from acquire.calibrate.calibration import FORMAT, QUANTITIES, Calibration, Measured
@@ -35,6 +36,9 @@ if TYPE_CHECKING:
 UNCERTAINTY = "_uncertainty"
 ROOT = "zarr.json"
 HINT = "the path of a calibration (a directory NAME.zarr), as `acquire calibrate dark … --out` writes it"
+
+COPY = "the copy that a recording carries, as acquire calibrate show RECORDING shows it"
+AGAIN = "another copy of the calibration, or measure it again"
 
 
 def save_calibration(place: Path | str, calibration: Calibration) -> None:
@@ -88,10 +92,14 @@ def open_calibration(place: Path | str) -> Calibration:
     except (GroupNotFoundError, *DAMAGE) as error:
         raise DataError(
             f"{source}: {name} of the calibration is damaged: {error}",
-            possible="the copy that a recording carries, as acquire calibrate show RECORDING shows it",
-            hint="another copy of the calibration, or measure it again",
+            possible=COPY,
+            hint=AGAIN,
         ) from error
-    return Calibration.from_attrs(attributes, quantities)
+    try:
+        return Calibration.from_attrs(attributes, quantities)
+    except DataError as error:
+        # the model does not know where it came from
+        raise DataError(f"{source}: {error.message}", possible=COPY, hint=AGAIN) from error
 
 
 def _read(group: zarr.Group, name: str) -> Any:
@@ -120,6 +128,10 @@ def _write(directory: Path, calibration: Calibration) -> None:
                 key,
                 shape=values.shape,
                 dtype="float64",
+                # A chunk that is lost later reads as NaN, which is refused, and not as zeros.
+                fill_value=np.nan,
+                # zstd does not notice every flipped bit
+                compressors=(ZstdCodec(), Crc32cCodec()),
                 dimension_names=quantity.dimensions,
                 attributes={"units": quantity.unit, "long_name": prefix + quantity.meaning},
             )

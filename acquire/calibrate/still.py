@@ -36,12 +36,24 @@ class Still:
     uncertainty : standard deviation of its elements
     misfit : RMS residual of the lines, relative to their RMS
     usable : (M,) columns with samples
+    unrest : correlation of the residuals of successive lines: 0 for noise, not of a scene that moves
     """
 
     image: NDArray[np.float64]
     uncertainty: float
     misfit: float
     usable: NDArray[np.bool_]
+    unrest: float = 0.0
+
+    @property
+    def detail(self) -> int:
+        """Width of the image's detail in fine pixels: where its rows are half alike, M at most."""
+        image = self.image[:, self.usable]
+        image = image - image.mean()
+        power = float((image**2).mean())
+        farthest = len(self.usable)
+        alike = ((image[:-far] * image[far:]).mean() < power / 2 for far in range(1, farthest))
+        return next((far for far, less in enumerate(alike, 1) if less), farthest)
 
     def blocks(self, substeps: int) -> NDArray[np.float64]:
         """Return the image in blocks of S × S fine pixels without overlap: (M, M)."""
@@ -99,4 +111,12 @@ def _still(
         uncertainty=noise * float(np.sqrt(np.diag(inverse).mean())),
         misfit=noise / level if level > 0 else 0.0,
         usable=usable,
+        unrest=_successive(residual[:, usable]),
     )
+
+
+def _successive(residual: NDArray[np.float64]) -> float:
+    """Return the correlation of each line's residual with the next one's, without the columns' means."""
+    change = residual - residual.mean(axis=0)
+    power = float((change**2).sum())
+    return float((change[:-1] * change[1:]).sum()) / power if power > 0 else 0.0

@@ -35,6 +35,11 @@ MOST_LINES = 4096
 """Upper limit on the lines used; more do not make an alignment better than its model."""
 UNLIKE = 0.5
 """Misfit of the arms' images, relative to their variation, beyond which they do not show the same."""
+UNREST = 0.3
+"""Correlation of the residuals of successive lines from which the target moved. One that moves by 0.3 fine
+pixels while 1024 lines are recorded has 0.4, by one 0.8; the shift is then wrong by 0.01 and by 0.05."""
+COARSE = 8
+"""Width of the target's detail, in fine pixels, from which an alignment is less certain than it says."""
 SAME_BALANCE = 0.002
 BALANCE_ERROR = 0.001
 """Uncertainty of the ratio of the arms' light over the field that both see."""
@@ -101,6 +106,7 @@ def alignment(exposure: Exposure, known: Calibration) -> Finding:
     shift = correlations(still_a.blocks(S), still_b.blocks(S))[MODEL][1]
     # the shift is in blocks of S fine pixels
     match = align(still_a, still_b, geometry, (S * shift[0], S * shift[1]))
+    _refuse_unlike(exposure, match)
     # now that the alignment shows which columns of arm B look beyond the field
     edge = field_edge(known, match.found.alignment, dimmed=match.fall_off.in_b)
     quantities = dict(edge.quantities)
@@ -126,9 +132,10 @@ def alignment(exposure: Exposure, known: Calibration) -> Finding:
         "brightness": round(match.brightness, 5),
         "shading_of_flat": known.steps["flat"].get("made") if shading else None,
         "dimmed": match.fall_off.in_b,
+        "fall_off": match.fall_off.facts(),
         "corrected": _corrected(known, quantities),
     }
-    warnings = []
+    warnings = _unfit(known, still_a, still_b)
     if edge.ends:
         warnings.append(
             "the flat's light ends at the field's edge, and arm B sees beyond it: gain and balance are "
@@ -160,6 +167,36 @@ def alignment(exposure: Exposure, known: Calibration) -> Finding:
         facts=facts,
         warnings=tuple(warnings),
     )
+
+
+def _refuse_unlike(exposure: Exposure, match: Match) -> None:
+    """Raise UsageError for images that do not show the same."""
+    if match.misfit > UNLIKE:
+        raise UsageError(
+            f"{exposure.recording}: the arms' images differ by {match.misfit:.0%} of their variation, and do "
+            "not show the same",
+            possible="a target at rest, in focus in both cameras, under the recording's own code",
+            hint="acquire diagnose checks the code; acquire camera live shows the focus",
+        )
+
+
+def _unfit(known: Calibration, *stills: Still) -> list[str]:
+    """Warn of a target that moved, and of one without fine detail."""
+    warnings = []
+    unrest, detail = max(each.unrest for each in stills), max(each.detail for each in stills)
+    # an unknown offset is in all lines alike, too
+    if "offset_dn" in known.quantities and unrest > UNREST:
+        warnings.append(
+            f"the target moved while it was recorded, or its light flickered (successive lines are alike to "
+            f"{unrest:.0%} in what a scene at rest does not explain): the alignment is less certain than it "
+            "says; repeat it with the target at rest"
+        )
+    if detail >= COARSE:
+        warnings.append(
+            f"the target's detail is about {detail} fine pixels wide: coarse, or out of focus; the alignment "
+            "is less certain than it says; focus both cameras, or use a target with detail of 2 to 6"
+        )
+    return warnings
 
 
 def tile_alignments(exposure: Exposure, known: Calibration) -> Finding:

@@ -299,7 +299,12 @@ def show(
     from acquire.store.layout import READABLE
     from acquire.store.opening import format_of
 
-    if format_of(calibration) in READABLE:  # a recording: show the copy that it carries
+    try:
+        is_recording = format_of(calibration) in READABLE
+    except PlaceError:
+        # `open_calibration` says what it lacks to be a calibration
+        is_recording = False
+    if is_recording:  # show the copy that it carries
         carried = calibration_of(open_recording(calibration))
         if carried is None:
             raise PlaceError(

@@ -390,6 +390,7 @@ def _with_orientation(recording: Recording, arguments: Arguments) -> Arguments:
     from acquire.recon.hypotheses import AS_BUILT
     from acquire.recon.search import Standing
     from acquire.reconstruct.diagnose import diagnose_recording, diagnosed_range
+    from acquire.reconstruct.reorient import reoriented
 
     first, count = diagnosed_range(recording, *requested_lines(recording, arguments))
     found = diagnose_recording(recording, first, count, arguments.options.calibration)
@@ -397,7 +398,13 @@ def _with_orientation(recording: Recording, arguments: Arguments) -> Arguments:
     # Only if nothing else explains the lines as well: a wrong turn would spoil a video that is right.
     if found.standing is Standing.NAMED and turn != AS_BUILT and found.alternative is None:
         note(f"{TURNED[turn]}; the reconstruction corrects this")
-        return replace(arguments, options=replace(arguments.options, turn=turn))
+        known = arguments.options.calibration
+        # one that does not hold the arms' orientation, or what depends on it, has nothing to be turned
+        if known is not None and (known.orientation or known.alignment):
+            moved = reoriented(recording.cut(first, count), known, turn)
+            note(f"the calibration was made before that: {moved.words}")
+            known = moved.calibration
+        return replace(arguments, options=replace(arguments.options, turn=turn, calibration=known))
     note(f"the orientation is left as it is: {found.sentence}")
     return arguments
 

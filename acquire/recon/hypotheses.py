@@ -134,14 +134,14 @@ class LineModel:
     """Gaussian model of the lines of both arms, which gives the evidence for hypotheses; caches its results.
 
     ``bits(start, length)`` returns bits of the code, counted from the segment's first one; if None, bits
-    beyond the segment's are unknown.
+    beyond the segment's are unknown. ``alignment`` is the segment's, and may be replaced.
     """
 
     def __init__(self, segment: Segment, bits: Callable[[int, int], NDArray[np.uint8]] | None = None) -> None:
         self.substeps = segment.geometry.substeps
         self.stages = segment.geometry.stages
         self._bits = bits or padded(segment.code)
-        self._size, self._alignment = segment.geometry.size, segment.alignment
+        self._size, self.alignment = segment.geometry.size, segment.alignment
         self.first, self.arms = prepared_lines(segment)
         self.lines, self.pixels = self.arms[0].shape
         # a cache of this object alone: it ends with it, and another prior can empty it
@@ -172,10 +172,10 @@ class LineModel:
         turn = hypothesis.turn
         # both in arm A's axes, for the alignment: a displaced arm would otherwise seem early or late
         a, b = views[0].scene(0), turn.to_a(views[1].scene(1))
-        if self._alignment is not None:
+        if self.alignment is not None:
             a, b = (
-                _displaced(a, self._size, self._alignment.to_a),
-                _displaced(b, self._size, self._alignment.to_b),
+                _displaced(a, self._size, self.alignment.to_a),
+                _displaced(b, self._size, self.alignment.to_b),
             )
         # what arm B saw predicts arm A, and the other way round
         scenes = (b, turn.to_b(a))

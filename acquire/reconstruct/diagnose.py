@@ -10,9 +10,10 @@ import numpy as np
 from acquire.calibrate import calibrated
 from acquire.codes import code_from_attrs
 from acquire.lines import ARMS
-from acquire.recon.diagnosis import Diagnosis, diagnose
-from acquire.recon.hypotheses import MOST_LINES, Hypothesis
+from acquire.recon.diagnosis import TURNED, Diagnosis, diagnose
+from acquire.recon.hypotheses import AS_BUILT, MOST_LINES, Hypothesis
 from acquire.recon.search import Standing
+from acquire.reconstruct.reorient import reoriented
 from acquire.reconstruct.select import by_lines
 from acquire.stream.lightcheck import Judge, Sight, Verdict, explain
 
@@ -24,6 +25,7 @@ if TYPE_CHECKING:
     from acquire.lines import Segment
     from acquire.store import Recording
 
+SINCE = "since the calibration was made"
 FAR_LINES = 8192
 """Lines for the light check, which finds delays of thousands of sub-steps."""
 
@@ -63,9 +65,28 @@ def diagnose_recording(
         return code.bits(begin + start, length)
 
     found = diagnose(segment, bits)
+    turn = AS_BUILT if found.hypothesis is None else found.hypothesis.turn
+    if calibration is not None and found.standing is Standing.NAMED and turn in TURNED:
+        return _since_calibration(found, recording.cut(first, count, tile), calibration)
     if found.standing is not Standing.UNEXPLAINED:
         return found
     return _with_light_check(recording, found, tile)
+
+
+def _since_calibration(found: Diagnosis, segment: Segment, calibration: Calibration) -> Diagnosis:
+    """Complete a diagnosis of turned arms: a calibration with their orientation was made before the turn.
+
+    A delay that was found together with it may be the alignment's, which no longer lies where it was.
+    """
+    if calibration.orientation is None and calibration.alignment is None:
+        return found
+    assert found.hypothesis is not None
+    turn = found.hypothesis.turn
+    if calibration.alignment is None or not reoriented(segment, calibration, turn).aligned:
+        return replace(found, sentence=f"{found.sentence} ({SINCE})")
+    return replace(
+        found, sentence=f"{TURNED[turn]} ({SINCE})", hypothesis=Hypothesis(turn=turn), alternative=None
+    )
 
 
 def _with_light_check(recording: Recording, found: Diagnosis, tile: Tile | None) -> Diagnosis:

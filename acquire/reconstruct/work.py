@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 import numpy as np
 
 from acquire.calibrate import calibrated
+from acquire.calibrate.apply import aligned
 from acquire.plugins import SOLVERS
 from acquire.recon import reconstruct
 from acquire.recon.balance import divided
@@ -42,7 +43,8 @@ class Options:
     """How to solve; see `acquire.recon.reconstruct`. ``budget_s`` is for the whole request.
 
     ``calibration`` corrects the lines; None leaves them to the cameras' configuration. ``turn`` is a further
-    correction of the arms' orientation, ``balance`` the balance by which arm B's light is then divided,
+    correction of the arms' orientation, for which the calibration has to be that of turned arms
+    (`acquire.reconstruct.reorient`), ``balance`` the balance by which arm B's light is then divided,
     ``check`` whether unexplained lines are diagnosed, and ``error`` whether the video's error is estimated.
     The solver's options and the denoiser's name may be those of a plug-in. ``shared`` is whether one tile's
     choice of prior and weight is handed to the others, and one sub-segment's to those after it; None shares
@@ -201,9 +203,13 @@ def solve(task: Task, watch: Watch) -> Part:
 
 def as_read(lines: Segment, options: Options) -> Segment:
     """Return lines with the calibration and the correction of the arms' orientation applied."""
-    if options.calibration is not None:
-        lines = calibrated(lines, options.calibration)
-    return undo_turn(lines, options.turn)
+    known, turn = options.calibration, options.turn
+    if known is None:
+        return undo_turn(lines, turn)
+    if turn == AS_BUILT:
+        return calibrated(lines, known)
+    # the alignment is that of the arms after the turn, which may exchange them
+    return aligned(undo_turn(calibrated(lines, replace(known, alignment=None)), turn), known.alignment)
 
 
 def _why_not_trusted(result: Reconstruction, segment: SubSegment) -> str | None:

@@ -148,7 +148,7 @@ def test_a_truncated_array_is_reported(tmp_path: Path, whole: Calibration) -> No
 def test_another_instruments_calibration_is_refused(
     tmp_path: Path, known: Calibration, changes: dict[str, object], said: str
 ) -> None:
-    path = record(tmp_path / "run.zarr", white(0.2), "target", 32, **changes)
+    path = record(tmp_path / "run.zarr", white(0.0), "target", 32, **changes)
     with pytest.raises(UsageError, match=said):
         check_fits(known, open_recording(path))
     with pytest.raises(UsageError, match="another instrument"):
@@ -197,6 +197,45 @@ def test_quantities_are_finite_and_of_the_instruments_size(known: Calibration) -
             Calibration(known.instrument, {name: Measured(values, np.zeros_like(values))})
     with pytest.raises(UsageError, match="uncertainties"):
         Measured(np.ones(2), np.ones(3))
+
+
+@pytest.mark.parametrize("name", ["gain", "balance"])
+def test_what_lines_are_divided_by_is_above_zero(known: Calibration, name: str) -> None:
+    """A gain of 0 ended the reconstruction with a screen of numbers, and no word of the calibration."""
+    values = known.quantities[name].value.copy()
+    values.flat[1] = 0.0
+    measured = Measured(values, known.quantities[name].uncertainty)
+    with pytest.raises(UsageError, match=f"{name} of the calibration is not above 0"):
+        replace(known, quantities={**known.quantities, name: measured})
+
+
+@pytest.mark.parametrize("name", ["offset_dn", "gain_uncertainty"])
+def test_values_that_are_lost_on_the_disk_are_not_zeros(
+    tmp_path: Path, known: Calibration, name: str
+) -> None:
+    """Zarr fills in for a chunk that is missing: offsets were 0 DN, without a word."""
+    save_calibration(tmp_path / "cal.zarr", known)
+    (tmp_path / "cal.zarr" / name / "c" / "0" / "0").unlink()
+    with pytest.raises(DataError, match=r"offset_dn of shape|uncertainties of gain"):
+        open_calibration(tmp_path / "cal.zarr")
+
+
+def test_a_flipped_bit_is_noticed(tmp_path: Path, known: Calibration) -> None:
+    save_calibration(tmp_path / "cal.zarr", known)
+    chunk = tmp_path / "cal.zarr" / "gain" / "c" / "0" / "0"
+    values = bytearray(chunk.read_bytes())
+    values[len(values) // 2] ^= 4
+    chunk.write_bytes(bytes(values))
+    with pytest.raises(DataError, match="gain of the calibration is damaged"):
+        open_calibration(tmp_path / "cal.zarr")
+
+
+def test_a_step_without_its_values_is_damaged(known: Calibration) -> None:
+    """A deleted array left the flat's step without gains, and lines uncorrected without a word."""
+    attrs = known.to_attrs()
+    del attrs["quantities"]["gain"]
+    with pytest.raises(DataError, match="gain, which its step flat measured, is missing"):
+        Calibration.from_attrs(attrs)
 
 
 def test_a_true_calibration_holds(recordings: dict[str, Path], whole: Calibration) -> None:

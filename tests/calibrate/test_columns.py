@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from instruments import ALL, COLUMNS, NOISE, columns_truth, record, white
+from instruments import ALL, COLUMNS, NOISE, columns_truth, dots, record, white
 
 from acquire.calibrate import Calibration
 from acquire.calibrate.columns import ambient, dark, dark_edges, flat
@@ -170,11 +170,49 @@ def test_dark_lines_that_reach_zero_are_refused(tmp_path: Path) -> None:
     assert "BlackLevel" in told.value.hint
 
 
-def test_lit_lines_are_not_dark_unless_the_lens_is_covered(recordings: dict[str, Path]) -> None:
-    exposure = open_exposure(recordings["flat"])
-    with pytest.raises(UsageError, match="is not dark"):
-        dark(exposure)
-    assert dark(exposure, covered=True).facts["covered"] is True
+def test_lit_lines_are_not_dark(recordings: dict[str, Path], tmp_path: Path) -> None:
+    """With --covered, a lit flat and a lit target were taken as dark, their light as offsets."""
+    for light, why in (("flat", "its light was steady"), ("target", "its light blinked with a code")):
+        exposure = open_exposure(recordings[light])
+        with pytest.raises(UsageError, match=why) as told:
+            dark(exposure)
+        assert "--covered" in told.value.hint
+        with pytest.raises(UsageError, match="so the lens was open"):
+            dark(exposure, covered=True)
+    # a lamp that is small, dim, and somewhere
+    led = {"name": "x", "shape": "square", "row": 0.3, "column": 0.7, "size": 0.15}
+    led["drive"] = {"waveform": "sine", "frequency_hz": 900.0, "low": 0.0, "high": 0.2}
+    lamp = white(effects=NOISE).model_dump() | {"leds": [led]}
+    path = record(tmp_path / "lamp.zarr", type(white()).model_validate(lamp), "target")
+    with pytest.raises(UsageError, match="follow the light's code"):
+        dark(open_exposure(path), covered=True)
+
+
+def test_a_covered_lens_allows_any_code(tmp_path: Path) -> None:
+    effects = [*NOISE, *COLUMNS, {"kind": "drift", "offset_dn_per_hour": 1e4}]
+    path = record(tmp_path / "covered.zarr", white(0.0, effects), "target")
+    assert dark(open_exposure(path), covered=True).facts["covered"] is True
+
+
+def test_room_light_in_a_dark_is_reported(tmp_path: Path) -> None:
+    effects = [*NOISE, {"kind": "stray_light", "ambient": 0.1}]
+    found = dark(open_exposure(record(tmp_path / "dark.zarr", white(effects=effects), "dark")))
+    assert "ambient light takes this part" in found.warnings[0]
+
+
+def test_a_flat_of_a_target_is_refused(tmp_path: Path, known: Calibration) -> None:
+    """Its texture was taken for gains that differ by 25 %."""
+    path = record(tmp_path / "flat.zarr", dots(tmp_path, ALL), "flat")
+    with pytest.raises(UsageError, match="is not uniform") as told:
+        flat(open_exposure(path), known, smooth=True)
+    assert "white card" in told.value.hint
+
+
+def test_an_uneven_flat_says_what_it_may_be(tmp_path: Path, known: Calibration) -> None:
+    path = record(tmp_path / "flat.zarr", white(0.45, [*ALL, {"kind": "vignetting", "loss": 0.3}]), "flat")
+    exposure = open_exposure(path)
+    assert "falls smoothly by 1" in flat(exposure, known).warnings[0]
+    assert not any("smoothly" in each for each in flat(exposure, known, smooth=True).warnings)
 
 
 @pytest.mark.parametrize(

@@ -75,7 +75,28 @@ def test_each_part_is_left_out_alone(taken: dict[str, Path], lens: Calibration) 
 def test_a_check_with_the_same_flat_finds_no_change(taken: dict[str, Path], lens: Calibration) -> None:
     """The lens's dark edges were taken for the field's end, which the alignment had not done."""
     found = check(open_exposure(taken["flat"]), lens)
-    assert [each.change for each in found.compared] == pytest.approx([0, 0], abs=1e-9)
+    assert [each.change for each in found.compared] == pytest.approx([0, 0, 0], abs=1e-9)
+
+
+@pytest.mark.parametrize(("loss", "change"), [(0.1, 0.118), (0.0, 0.176)])
+def test_another_fall_of_the_light_is_told_from_gains(
+    lens: Calibration, tmp_path: Path, loss: float, change: float
+) -> None:
+    """By a flat: half of the loss in a corner is at the middle of a side. Gains were said to have changed."""
+    effects = [e | {"loss": loss} if e["kind"] == "vignetting" else e for e in EFFECTS]
+    found = check(open_exposure(record(tmp_path / "flat.zarr", white(effects=effects), "flat", 1024)), lens)
+    by_name = {each.quantity: each for each in found.compared}
+    light = by_name["light towards a side, in the flat"]
+    assert light.change == pytest.approx(change, abs=0.015)
+    assert not light.holds
+    assert by_name["gain"].holds
+
+
+def test_a_lens_of_one_arm_is_seen_in_a_target(lens: Calibration, tmp_path: Path) -> None:
+    lens_of_b = {"kind": "vignetting", "loss": 0.5, "arm": "b"}
+    effects = [lens_of_b if each["kind"] == "vignetting" else each for each in EFFECTS]
+    found = check(open_exposure(record(tmp_path / "t.zarr", dots(tmp_path, effects), "target", 1024)), lens)
+    assert "light towards a side, arm against arm" in {e.quantity for e in found.compared if not e.holds}
 
 
 def test_a_repeated_flat_says_that_the_target_comes_next(taken: dict[str, Path], lens: Calibration) -> None:
@@ -100,7 +121,7 @@ def test_calibrations_from_before_the_lens_are_read(lens: Calibration) -> None:
     attrs = lens.to_attrs()
     del attrs["quantities"]["shading"]
     del attrs["alignment"]["distortion"]
-    for key in ("shading_of_flat", "dimmed", "corrected"):
+    for key in ("shading_of_flat", "dimmed", "corrected", "fall_off"):
         del attrs["steps"]["align"][key]
     old = Calibration.from_attrs(attrs)
     assert old.alignment is not None

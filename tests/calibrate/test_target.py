@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 from instruments import COLUMNS, NOISE, N, S, columns_truth, dots, record, white
+from scipy.ndimage import gaussian_filter, shift
 
 from acquire.alignment import Alignment
 from acquire.calibrate import Calibration, Measured, calibrated
@@ -274,3 +275,39 @@ def test_a_lens_that_dims_the_edges_is_in_the_model(tmp_path: Path, lens: dict[s
 
 def test_lenses_without_a_fall_of_light_have_none(recordings: dict[str, Path], known: Calibration) -> None:
     assert "shading" not in alignment(open_exposure(recordings["target"]), known).quantities
+
+
+def moving(tmp_path: Path, pixels: float) -> Path:
+    """A target that moves down by so many fine pixels while 512 lines are recorded."""
+    scene = dots(tmp_path, NOISE)
+    picture = np.load(scene.path)[0]
+    steps = np.arange(32) * pixels / 32
+    np.save(scene.path, np.stack([shift(picture, (step, 0), order=1) for step in steps]).astype(np.float32))
+    table = scene.model_dump() | {"frame_rate_hz": 32 / (512 * S * 1e-5)}
+    return record(tmp_path / "moving.zarr", type(scene).model_validate(table), "target")
+
+
+def test_a_target_that_moved_is_reported(tmp_path: Path, recordings: dict[str, Path]) -> None:
+    """It gave an alignment with an error of seven of its uncertainties, without a word."""
+    path = record(tmp_path / "dark.zarr", white(effects=NOISE), "dark")
+    first = dark(open_exposure(path))
+    known = Calibration(first.instrument).with_step(first)
+    found = alignment(open_exposure(moving(tmp_path, 1.0)), known)
+    assert "the target moved while it was recorded" in found.warnings[0]
+
+
+def test_a_target_out_of_focus_is_reported(tmp_path: Path, known: Calibration) -> None:
+    scene = dots(tmp_path, NOISE)
+    np.save(scene.path, gaussian_filter(np.load(scene.path), (0, 6, 6)))
+    path = record(tmp_path / "blurred.zarr", scene, "target")
+    found = alignment(open_exposure(path), known)
+    assert any("coarse, or out of focus" in each for each in found.warnings)
+
+
+def test_images_that_do_not_show_the_same_are_refused(
+    monkeypatch: pytest.MonkeyPatch, recordings: dict[str, Path], known: Calibration
+) -> None:
+    """A target that moved by 30 fine pixels was aligned with a misfit of 74 %."""
+    monkeypatch.setattr("acquire.calibrate.target.UNLIKE", 0.001)
+    with pytest.raises(UsageError, match="do not show the same"):
+        alignment(open_exposure(recordings["target"]), known)

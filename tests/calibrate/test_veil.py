@@ -13,7 +13,6 @@ from test_psf import RIG, SIZE, board
 from acquire.calibrate import Calibration, Measured, calibrated
 from acquire.calibrate.columns import dark
 from acquire.calibrate.exposure import open_exposure
-from acquire.calibrate.orientation import oriented, view_named
 from acquire.calibrate.veil import veil
 from acquire.calibrate.words import known_facts
 from acquire.errors import UsageError
@@ -108,7 +107,7 @@ def test_it_is_in_the_model_if_it_is_clear(known: tuple[Calibration, Segment]) -
     corrected = calibrated(segment, calibration)
     assert corrected.blur is not None
     assert corrected.blur.veil == (0.01, 0.03)
-    turned = oriented(corrected, view_named("turn 270"))
+    turned = calibrated(segment, replace(calibration, orientation="turn 270"))
     assert turned.blur is not None
     assert turned.blur.veil == (0.03, 0.01)  # the veil is the camera's
     unclear = Measured(np.array([0.01, 0.03]), np.full(2, 0.02))

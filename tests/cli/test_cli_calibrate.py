@@ -52,7 +52,7 @@ def test_step_by_step_to_a_page(cli: Cli, taken: dict[str, Path], tmp_path: Path
     assert cli("calibrate", "show", cal, "--json").json["orientation"] == "turn 90"
     answer = cli("calibrate", "check", cal, taken["target"])
     assert answer.code == 0, answer.err
-    assert answer.out.count("holds") == 5
+    assert answer.out.count("holds") == 6
 
 
 def test_a_failed_check_names_what_has_changed(cli: Cli, taken: dict[str, Path], tmp_path: Path) -> None:
@@ -156,3 +156,10 @@ def test_one_of_another_instrument_is_refused(cli: Cli, taken: dict[str, Path], 
     answer = cli("reconstruct", other, "--out", tmp_path / "v.zarr", "--calibration", tmp_path / "no.zarr")
     assert answer.code == 2
     assert cli("calibrate", "show", other).code == 2
+
+
+def test_what_is_no_calibration_is_not_called_no_recording(cli: Cli, tmp_path: Path) -> None:
+    (tmp_path / "cal.zarr").mkdir()
+    answer = cli("calibrate", "show", tmp_path / "cal.zarr")
+    assert answer.code == 2
+    assert "is not a calibration: it holds no zarr.json" in answer.err
