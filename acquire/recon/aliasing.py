@@ -24,8 +24,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from acquire.lines import Segment
-    from acquire.recon.clock import IterationClock
-    from acquire.recon.problem import Problem
+    from acquire.recon.given import Given
 
 PATTERNS, WEAKEST = 4, 1e-3
 """Largest number of patterns, and the smallest norm of one relative to the strongest."""
@@ -49,16 +48,10 @@ LARGEST_SPAN = 2048
 
 
 def detect_unresolved_light(
-    segment: Segment,
-    problem: Problem,
-    predicted: NDArray[Any],
-    video: NDArray[Any],
-    *,
-    resolved_hz: float,
-    clock: IterationClock,
+    given: Given, predicted: NDArray[Any], video: NDArray[Any], resolved_hz: float
 ) -> tuple[str, ...]:
     """Return a sentence if light of one frequency beyond ``resolved_hz`` stands out of the residual."""
-    found_hz = unresolved_hz(segment, problem, predicted, video, resolved_hz=resolved_hz, clock=clock)
+    found_hz = unresolved_hz(given, predicted, video, resolved_hz)
     if found_hz is None:
         return ()
     return (
@@ -68,21 +61,15 @@ def detect_unresolved_light(
 
 
 def unresolved_hz(
-    segment: Segment,
-    problem: Problem,
-    predicted: NDArray[Any],
-    video: NDArray[Any],
-    *,
-    resolved_hz: float,
-    clock: IterationClock,
+    given: Given, predicted: NDArray[Any], video: NDArray[Any], resolved_hz: float
 ) -> float | None:
     """Return the frequency beyond ``resolved_hz`` that stands out of the residual most, if one does.
 
     ``predicted`` is as `Problem.samples`, ``video`` (frames, n′, n′) in any unit. None is returned also if
     there is no time for the search, or if the segment is long.
     """
-    span = segment.geometry.span
-    if span > LARGEST_SPAN or not clock.affords(SECONDS * (span / SPAN) ** 3):
+    segment, problem, span = given.segment, given.problem, given.segment.geometry.span
+    if span > LARGEST_SPAN or not given.clock.affords(SECONDS * (span / SPAN) ** 3):
         return None
     rate_hz = 1e9 / segment.substep_ns
     # cosine k of the sub-steps is light of k·rate/(2·span)

@@ -35,6 +35,7 @@ from acquire.recon.blinking import (
 from acquire.recon.candidates import CALM, SMOOTH, STILL, VOLUME
 from acquire.recon.cycle import find_period
 from acquire.recon.estimates import Preferred, Refined
+from acquire.recon.given import Given
 from acquire.recon.holdout import HeldOut
 from acquire.recon.patterns import find_patterns
 from acquire.recon.reuse import reuse_choice
@@ -89,14 +90,14 @@ class AdmmSolver(Solver):
         If the options give a bandwidth, weight, denoiser or start, the cosines are solved for without a
         choice.
         """
-        held_out = HeldOut(problem, segment.geometry)
+        given, held_out = Given(segment, problem, options, clock), HeldOut(problem, segment.geometry)
         fixed = (options.denoiser, options.tv_weight, options.bandwidth, options.initial)
         if not held_out or any(each is not None for each in fixed):
-            return solve_in_cosines(segment, problem, options, clock)
-        bench = Workbench(segment, problem, options, clock, held_out)
+            return solve_in_cosines(given)
+        bench = Workbench(given, held_out)
         trials = max(4, options.iterations // ITERATIONS_PER_TRIAL)
         if options.choice is not None:
-            reused = reuse_choice(bench, segment, options, trials)
+            reused = reuse_choice(bench, trials)
             if reused is not None:
                 return reused
         if bench.frames == 1:
@@ -106,21 +107,19 @@ class AdmmSolver(Solver):
         if clock.spent(SEARCH_SHARE):
             clock.shortcuts.append("the budget left no time to try more than one kind of motion")
             return bench.finish(volume)
-        return _choose(bench, segment, options, volume, trials)
+        return _choose(bench, volume, trials)
 
 
-def _choose(
-    bench: Workbench, segment: Segment, options: SolveOptions, volume: Trial, trials: int
-) -> Estimate:
+def _choose(bench: Workbench, volume: Trial, trials: int) -> Estimate:
     """Compare a first volume with a still, the cosines and the other priors, and solve with the best.
 
     Scenes that blink need most of a budget for the cosines, and others need it for the search: a glance
     decides which comes first. Many cosines take ten times as long as a trial of the others.
     """
-    problem, clock = bench.problem, bench.clock
+    given, clock = bench.given, bench.clock
     plain = bench.attempt(bench.fitting(STILL), FIRST_ITERATIONS)
     at_rest = plain.error < EXPLAINED and not bench.held_out.clearly_less(volume.errors, plain.errors)
-    cosines = glance(segment, problem, options, clock, plain.coefficients if at_rest else None)
+    cosines = glance(given, plain.coefficients if at_rest else None)
     # taken now, because the trials below forget how long the cosines' iterations are
     rest_s = (LONGER_LOOK - GLANCE) * clock.longest_s
     errors = bench.record_errors({"prior": "cosines"} | cosines.facts(), cosines.predict())
@@ -140,17 +139,17 @@ def _choose(
             tried.cycle = cycle if cycle.error < REPEATS * rival else None
     ahead, refined = at_a_glance <= OUTDONE * tried.best.error, None
     if ahead:
-        complete_look(cosines, options, clock)
+        complete_look(given, cosines)
         if find_patterns(host(cosines.solver.theta)) is not None:
-            refined = refine(segment, problem, options, clock, cosines)
+            refined = refine(given, cosines)
             if (clear or isinstance(refined, Refined)) and _wins(bench, refined, tried.best):
                 return Preferred(refined, bench.record)
     best = _search(bench, tried, trials, bench.error(cosines.predict()) if ahead else np.inf)
     near = at_a_glance < DOUBTFUL * best.error and clock.affords(rest_s, FIRST_LOOK_SHARE)
     if not ahead and near:
-        complete_look(cosines, options, clock)
+        complete_look(given, cosines)
     if refined is None and (ahead or near) and _worth_refining(bench, cosines, best):
-        refined = refine(segment, problem, options, clock, cosines)
+        refined = refine(given, cosines)
     if refined is not None and _wins(bench, refined, best):
         return Preferred(refined, bench.record)
     return bench.finish(best)
@@ -202,7 +201,7 @@ def _search(bench: Workbench, tried: _Tried, trials: int, rival: float) -> Trial
         volume = bright
     if plain.error < FAR * volume.error:
         explains = plain.error < EXPLAINED
-        merge = bench.options.spatial_merge
+        merge = bench.given.options.spatial_merge
         still = best_still(plain, trials, merge=merge) if explains else bench.climb(plain, trials)
     # where much moves, the still was not searched further, and is no ground for a change
     if still is not plain:

@@ -14,11 +14,8 @@ from acquire.recon.estimates import InBand
 
 if TYPE_CHECKING:
     from acquire.arrays import Array
-    from acquire.lines import Segment
     from acquire.recon.basis import Basis
-    from acquire.recon.clock import IterationClock
-    from acquire.recon.options import SolveOptions
-    from acquire.recon.problem import Problem
+    from acquire.recon.given import Given
 
 TENTATIVE_SHARE = 0.15
 """Share of the budget after which the search for the bandwidth hurries."""
@@ -36,19 +33,11 @@ STILL = AdmmParameters(tv_weight=5e-6, tv_penalty=1e-5, sign_penalty=3e-6, gradi
 thousand times that of a detail: lower penalties admit details, and more gradient steps reach them."""
 
 
-def begin_in_cosines(
-    segment: Segment,
-    problem: Problem,
-    options: SolveOptions,
-    basis: Basis,
-    start: Array | None,
-    *,
-    explained: bool = False,
-) -> InBand:
+def begin_in_cosines(given: Given, basis: Basis, start: Array | None, *, explained: bool = False) -> InBand:
     """A solver in the coefficients of a basis, from a start."""
-    N_m, T_m = options.spatial_merge, options.temporal_merge
-    frames, side, _ = segment.geometry.video_shape(N_m, T_m)
-    operator = segment_operator(segment, basis, N_m, T_m)
+    problem, options = given.problem, given.options
+    frames, side, _ = given.video_shape
+    operator = segment_operator(given.segment, basis, *given.merges)
     parameters = parameters_for(frames, explained=explained)
     if options.tv_weight is not None:
         parameters = replace(parameters, tv_weight=options.tv_weight)
@@ -64,15 +53,14 @@ def begin_in_cosines(
     return InBand(solver, operator, basis, problem, parameters)
 
 
-def find_band(segment: Segment, problem: Problem, options: SolveOptions, clock: IterationClock) -> int:
+def find_band(given: Given) -> int:
     """Number of cosines: as requested, or as the lines show, or a few if the budget leaves no time."""
-    N_m, T_m = options.spatial_merge, options.temporal_merge
-    frames = segment.geometry.video_shape(N_m, T_m)[0]
-    if options.bandwidth is not None:
-        return min(frames, max(1, round(options.bandwidth * frames)))
+    segment, clock, frames = given.segment, given.clock, given.video_shape[0]
+    if given.options.bandwidth is not None:
+        return min(frames, max(1, round(given.options.bandwidth * frames)))
     if clock.spent(UNSEARCHED_SHARE):
         few = min(frames, FEWEST_COEFFICIENTS)
-        limit_hz = few * cosine_hz(segment.substep_ns * T_m, frames)
+        limit_hz = few * cosine_hz(segment.substep_ns * given.options.temporal_merge, frames)
         clock.shortcuts.append(
             "the budget left no time to search for the scene's bandwidth: the video holds only changes "
             f"slower than {limit_hz:.3g} Hz"
@@ -80,8 +68,8 @@ def find_band(segment: Segment, problem: Problem, options: SolveOptions, clock: 
         return few
     return estimate_coefficients(
         segment,
-        problem,
-        (N_m, T_m),
+        given.problem,
+        given.merges,
         partial(clock.spent, TENTATIVE_SHARE),
         partial(clock.affords, share=LAMPS_SHARE),
     )

@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from acquire.recon.clock import IterationClock
     from acquire.recon.error import VideoError
     from acquire.recon.estimates import Estimate
+    from acquire.recon.given import Given
     from acquire.recon.problem import Problem
     from acquire.recon.result import Quality
 
@@ -57,31 +58,24 @@ class Continued:
 
 
 def estimate_error(
-    segment: Segment,
-    problem: Problem,
-    estimate: Estimate,
-    clock: IterationClock,
-    *,
-    video: NDArray[Any],
-    quality: Quality,
-    merges: tuple[int, int],
-    cut: bool,
+    given: Given, estimate: Estimate, *, video: NDArray[Any], quality: Quality, cut: bool
 ) -> VideoError | str:
     """Estimate the error of ``video`` (T/T_m, n/N_m, n/N_m) in scene units, or return why there is none.
 
-    ``merges`` are N_m and T_m. ``cut`` says that the solver was ended before it converged.
+    ``cut`` says that the solver was ended before it converged.
     """
-    trusted = segment.geometry.trusted_frames(merges[1])
+    segment, problem, clock, (N_m, T_m) = given.segment, given.problem, given.clock, given.merges
+    trusted = segment.geometry.trusted_frames(T_m)
     if not range(len(video))[trusted]:
         return "no frame is sampled in full"
     if not (isinstance(estimate, Continuable) and problem.held_out.any()):
         return UNSUPPORTED
     began_s = clock.processor_s
     # before there is a second video: of a large sensor, each is a gigabyte
-    white = white_error(segment, problem, merges)
+    white = white_error(segment, problem, given.merges)
     facts = estimate.facts()
     at_rest = facts.get("prior") == "still" or bool(facts.get("change"))
-    fine = at_rest and merges[0] < segment.geometry.substeps
+    fine = at_rest and N_m < segment.geometry.substeps
     if cut or fine or "patterns" in facts:
         exponents, residual = BY_PRIOR, float(np.nanmax([quality.misfit, quality.prediction]))
         continued = _under_heavier_prior(problem, estimate, video, trusted, clock)

@@ -21,9 +21,7 @@ from acquire.recon.result import EXPLAINED as EXPLAINED_NOISE
 from acquire.recon.workbench import FIRST_ITERATIONS, NEXT_ITERATIONS, SEARCH_SHARE
 
 if TYPE_CHECKING:
-    from acquire.lines import Segment
     from acquire.recon.estimates import Estimate
-    from acquire.recon.options import SolveOptions
     from acquire.recon.result import Reconstruction
     from acquire.recon.workbench import Trial, Workbench
 
@@ -99,11 +97,11 @@ class Choice:
         return Candidate(self.prior, cosines, self.weight, self.pace, **known)  # type: ignore[arg-type]  # not cosines
 
 
-def reuse_choice(bench: Workbench, segment: Segment, options: SolveOptions, trials: int) -> Estimate | None:
+def reuse_choice(bench: Workbench, trials: int) -> Estimate | None:
     """Solve with the choice handed over; None if it does not fit, so that everything has to be searched."""
-    choice, frames, clock = options.choice, bench.frames, bench.clock
+    choice, frames, clock = bench.given.options.choice, bench.frames, bench.clock
     assert choice is not None
-    noise, at_rest = bench.problem.noise(segment), choice.prior == STILL.prior
+    noise, at_rest = bench.given.noise, choice.prior == STILL.prior
     if at_rest:
         own = bench.with_problem(bench.problem, fine=choice.fine)
         still = own.attempt(choice.candidate(frames), FIRST_ITERATIONS)
@@ -116,7 +114,7 @@ def reuse_choice(bench: Workbench, segment: Segment, options: SolveOptions, tria
     if at_rest:
         return bench.finish(still.bench.climb(still, trials)) if frames == 1 else None
     if choice.prior == COSINES:
-        return _in_cosines(bench, still, segment, options)
+        return _in_cosines(bench, still)
     if choice.period_frames * FEWEST_CYCLES > frames:
         return None
     bright = None
@@ -145,19 +143,20 @@ def _strengthened(best: Trial) -> Trial:
     return best
 
 
-def _in_cosines(bench: Workbench, still: Trial, segment: Segment, options: SolveOptions) -> Estimate | None:
+def _in_cosines(bench: Workbench, still: Trial) -> Estimate | None:
     """Solve in the band handed over, as `choose` does where cosines are ahead of a still."""
-    problem, clock, choice = bench.problem, bench.clock, options.choice
+    choice = bench.given.options.choice
     assert choice is not None
-    options = replace(options, bandwidth=min(1.0, choice.coefficients / bench.frames))
+    band = replace(bench.given.options, bandwidth=min(1.0, choice.coefficients / bench.frames))
+    given = replace(bench.given, options=band)
     # as in `choose`: from a start at zero the code would stay in the brightness
     start = still.admm.theta if still.error < EXPLAINED else None
-    cosines = first_look(segment, problem, options, clock, start)
+    cosines = first_look(given, start)
     bench.record_errors({"prior": COSINES} | cosines.facts(), cosines.predict())
-    found = refine(segment, problem, options, clock, cosines)
+    found = refine(given, cosines)
     errors = bench.record_errors({"prior": "patterns"} | found.facts(), found.predict())
     ahead = bench.held_out.clearly_less(errors, still.errors)
-    if ahead and choice.fits(bench.held_out.relative(errors), problem.noise(segment)):
+    if ahead and choice.fits(bench.held_out.relative(errors), given.noise):
         return Preferred(found, bench.record)
-    clock.reset()  # the search that follows may use all of its iterations
+    given.clock.reset()  # the search that follows may use all of its iterations
     return None

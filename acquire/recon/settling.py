@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
     from acquire.recon.clock import IterationClock
+    from acquire.recon.given import Given
     from acquire.recon.patterns import Refinement
     from acquire.recon.problem import Problem
 
@@ -57,14 +58,14 @@ TRIAL_AFTER, TRIAL_ROUNDS = 8, 5
 must predict better: first they have to take up the light of the others."""
 
 
-def settle(refinement: Refinement, problem: Problem, clock: IterationClock) -> Refinement:
+def settle(given: Given, refinement: Refinement) -> Refinement:
     """Refine until the held-out samples are predicted no better, or the clock ends it: the best state."""
-    course = _Course(refinement, problem)
+    clock, course = given.clock, _Course(refinement, given.problem)
     course.refine_until_idle(clock, LOOSENED_IN_VAIN, EARLY_ROUNDS * ROUND)
-    course.continue_with(_without_superfluous(course.refinement, problem, clock))
+    course.continue_with(_without_superfluous(given, course.refinement))
     if course.refine_until_idle(clock, LOOSENED_IN_VAIN, TRIAL_AFTER * ROUND):
         course.hold(course.likely_weight)
-    course.continue_with(_without_doubtful(course.refinement, problem, clock))
+    course.continue_with(_without_doubtful(given, course.refinement))
     # not held yet if no noise was fitted within `TRIAL_AFTER` rounds
     if course.refinement.loosens and course.refine_until_idle(clock, LOOSENED_IN_VAIN):
         course.hold(course.likely_weight)
@@ -142,21 +143,21 @@ class _Course:
         return refinement
 
 
-def _without_superfluous(refinement: Refinement, problem: Problem, clock: IterationClock) -> Refinement:
+def _without_superfluous(given: Given, refinement: Refinement) -> Refinement:
     """The refinement without doubtful patterns, unless a trial of equally many rounds shows them needed."""
-    fewer = _restricted(refinement)
+    fewer, clock = _restricted(refinement), given.clock
     if fewer is refinement or clock.iterations < LONG or not clock.affords(LONG * clock.mean_s):
         return fewer
-    without = _refine(fewer, EARLY_ROUNDS, problem, clock)
-    return fewer if without <= _refine(refinement, EARLY_ROUNDS, problem, clock) else refinement
+    without = early_error(given, fewer)
+    return fewer if without <= early_error(given, refinement) else refinement
 
 
-def _without_doubtful(refinement: Refinement, problem: Problem, clock: IterationClock) -> Refinement:
+def _without_doubtful(given: Given, refinement: Refinement) -> Refinement:
     """The refinement without doubtful patterns if the others soon predict the held-out samples better."""
-    error, fewer = problem.prediction_error(refinement.predict()), _restricted(refinement)
+    error, fewer = given.problem.prediction_error(refinement.predict()), _restricted(refinement)
     if fewer is refinement:
         return refinement
-    return fewer if _refine(fewer, TRIAL_ROUNDS, problem, clock) < error else refinement
+    return fewer if _refine(given, fewer, TRIAL_ROUNDS) < error else refinement
 
 
 def has_time(clock: IterationClock) -> bool:
@@ -164,14 +165,12 @@ def has_time(clock: IterationClock) -> bool:
     return clock.iterations >= LONG and clock.affords(LONG * clock.longest_s)
 
 
-def early_error(refinement: Refinement, problem: Problem, clock: IterationClock) -> float:
+def early_error(given: Given, refinement: Refinement) -> float:
     """The held-out error after the first rounds."""
-    return _refine(refinement, EARLY_ROUNDS, problem, clock)
+    return _refine(given, refinement, EARLY_ROUNDS)
 
 
-def better_than(
-    bound: float, rivals: Sequence[Callable[[], Refinement]], problem: Problem, clock: IterationClock
-) -> Refinement | None:
+def better_than(given: Given, bound: float, rivals: Sequence[Callable[[], Refinement]]) -> Refinement | None:
     """The best of refinements with more and more patterns, if its early error is below a ``bound``.
 
     The first one that does not predict clearly better than the one before it ends the search: one pattern too
@@ -180,20 +179,20 @@ def better_than(
     best, least, before = None, bound, np.inf
     for begin in rivals:
         refinement = begin()
-        error = early_error(refinement, problem, clock)
+        error = early_error(given, refinement)
         if error > ONE_MORE * before:
             break
         best, least = (refinement, error) if error < least else (best, least)
         before = error
-    clock.reset()
+    given.clock.reset()
     return best
 
 
-def _refine(refinement: Refinement, rounds: int, problem: Problem, clock: IterationClock) -> float:
+def _refine(given: Given, refinement: Refinement, rounds: int) -> float:
     """Refine for some rounds and return the held-out error."""
-    for _ in clock.run(rounds * ROUND, "refine", video=refinement.video, first=FIRST_ROUND):
+    for _ in given.clock.run(rounds * ROUND, "refine", video=refinement.video, first=FIRST_ROUND):
         refinement.step()
-    return problem.prediction_error(refinement.predict())
+    return given.problem.prediction_error(refinement.predict())
 
 
 def _restricted(refinement: Refinement) -> Refinement:

@@ -27,12 +27,10 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from acquire.arrays import Array
-    from acquire.lines import Segment
     from acquire.recon.basis import Basis
-    from acquire.recon.clock import IterationClock
     from acquire.recon.denoisers import Denoiser
+    from acquire.recon.given import Given
     from acquire.recon.holdout import HeldOut
-    from acquire.recon.options import SolveOptions
     from acquire.recon.problem import Operator, Problem
 
 FIRST_ITERATIONS, NEXT_ITERATIONS = 30, 25
@@ -110,34 +108,32 @@ class Workbench:
 
     def __init__(
         self,
-        segment: Segment,
-        problem: Problem,
-        options: SolveOptions,
-        clock: IterationClock,
+        given: Given,
         held_out: HeldOut,
         shared: Shared | None = None,
         *,
         fine: bool = False,
         still: Trial | None = None,
     ) -> None:
-        self._segment, self.problem, self.clock, self.held_out = segment, problem, clock, held_out
-        self.options, self._shared = options, shared or Shared()
+        self.given, self.held_out, self._shared = given, held_out, shared or Shared()
+        self.problem, self.clock = given.problem, given.clock
         self.fine, self.still = fine, still
         self.background = None if still is None else still.coefficients
-        self._merges = (1 if fine else options.spatial_merge, options.temporal_merge)
-        self.merge = options.spatial_merge if fine else 1
-        self.frames, self._side, _ = segment.geometry.video_shape(*self._merges)
+        spatial_merge, temporal_merge = given.merges
+        self._merges = (1 if fine else spatial_merge, temporal_merge)
+        self.merge = spatial_merge if fine else 1
+        self.frames, self._side, _ = given.segment.geometry.video_shape(*self._merges)
         self._brightness: NDArray[Any] | None = None  # of the next trials; a trial keeps its own
         self._bright_cosines = self.frames
         # successive trials mostly share one
         self._operators: dict[tuple[int, bool, float], Operator] = {}
 
         # energy of the normalised lines' response to steady light in the voxel in the middle of the picture
-        constant = TemporalBasis(self.frames, 1, problem.arrays)
+        constant = TemporalBasis(self.frames, 1, self.problem.arrays)
         point = np.zeros((1, self._side, self._side))
         point[0, self._side // 2, self._side // 2] = 1
-        lines = host(self._operator(constant, None).forward(problem.arrays.asarray(point)))
-        energy = float(np.square(lines / problem.norm, dtype=np.float64).sum()) or USUAL_ENERGY
+        lines = host(self._operator(constant, None).forward(self.problem.arrays.asarray(point)))
+        energy = float(np.square(lines / self.problem.norm, dtype=np.float64).sum()) or USUAL_ENERGY
         self._response = energy / USUAL_ENERGY
 
     @property
@@ -148,8 +144,8 @@ class Workbench:
         self, problem: Problem, *, fine: bool | None = None, still: Trial | None = None
     ) -> Workbench:
         """Another bench for the same lines: with other weights, ``fine``, or for changes from a ``still``."""
-        kept = self._segment, problem, self.options, self.clock, self.held_out, self._shared
-        return Workbench(*kept, fine=self.fine if fine is None else fine, still=still)
+        given, fine = replace(self.given, problem=problem), self.fine if fine is None else fine
+        return Workbench(given, self.held_out, self._shared, fine=fine, still=still)
 
     def merged(self, theta: Array) -> Array:
         """Coefficients of the requested voxels."""
@@ -238,7 +234,7 @@ class Workbench:
 
     def _fit_brightness(self, video: NDArray[Any], brightness: NDArray[Any] | None, cosines: int) -> None:
         """Use the brightness that a video, which has a ``brightness`` already, needs in the next trials."""
-        found = fit_brightness(self._segment, self.problem, video, self._merges, cosines)
+        found = fit_brightness(self.given.segment, self.problem, video, self._merges, cosines)
         found = found if brightness is None else found * brightness
         self._use_brightness(found / found.mean())
 
@@ -344,7 +340,7 @@ class Workbench:
             return theta
         if trial.bench.fine:
             return trial.admm.theta
-        n, merge = self._side, self.options.spatial_merge
+        n, merge = self._side, self.given.options.spatial_merge
         held = host(theta).repeat(merge, axis=1).repeat(merge, axis=2)[:, :n, :n]
         return self.problem.arrays.asarray(held)
 
@@ -403,7 +399,7 @@ class Workbench:
         return self._operators[key]
 
     def _new_operator(self, brightness: NDArray[Any] | None, basis: Basis) -> Operator:
-        segment = self._segment
+        segment = self.given.segment
         code: NDArray[Any] = segment.code
         if brightness is not None:
             code = code * np.repeat(brightness, self._merges[1])[: len(code)]

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+from typing import Any
+
 import numpy as np
 import pytest
 
@@ -176,9 +179,10 @@ def test_a_refinement_keeps_both_parts_when_it_returns_continues_and_drops_a_pat
 def test_the_number_of_patterns_rises_as_long_as_it_pays(
     errors: tuple[float, ...], bound: float, chosen: int | None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(settling, "early_error", lambda each, *_: errors[each])
+    monkeypatch.setattr(settling, "early_error", lambda _, each: errors[each])
     rivals = [lambda each=each: each for each in range(len(errors))]
-    found = settling.better_than(bound, rivals, None, IterationClock(1))  # type: ignore[arg-type]
+    asked: Any = SimpleNamespace(clock=IterationClock(1))
+    found = settling.better_than(asked, bound, rivals)  # type: ignore[arg-type]
     assert found == chosen
 
 

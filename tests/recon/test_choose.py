@@ -24,6 +24,7 @@ from acquire.recon.band import BandOperator
 from acquire.recon.bandwidth import light_beyond
 from acquire.recon.basis import TemporalBasis
 from acquire.recon.brightness import fit_brightness
+from acquire.recon.given import Given
 from acquire.recon.holdout import HeldOut
 from acquire.recon.options import SolveOptions
 from acquire.recon.problem import build_problem
@@ -189,9 +190,9 @@ def test_patterns_cut_short_are_not_worse_than_the_first_look(made: int) -> None
 
     problem = build_problem(lines, 3, 1, hold_out=0.08)
     options = SolveOptions(spatial_merge=3, temporal_merge=1, solver="admm", iterations=150, bandwidth=0.2)
-    progress = clock.IterationClock(150, None, watch, stop)
-    first = blinking.first_look(lines, problem, options, progress)
-    refined = blinking.refine(lines, problem, options, progress, first)
+    asked = Given(lines, problem, options, clock.IterationClock(150, None, watch, stop))
+    first = blinking.first_look(asked)
+    refined = blinking.refine(asked, first)
     assert stages.count("refine") == made
     assert problem.prediction_error(refined.predict()) <= problem.prediction_error(first.predict())
 
