@@ -81,6 +81,7 @@ def combine(
     recording: Recording,
     request: VideoRequest,
     out: Path | str,
+    *,
     options: Options,
     pool: Pool,
     watcher: Watcher,

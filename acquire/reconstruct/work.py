@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import time
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, field, fields, replace
+from inspect import signature
 from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
@@ -39,8 +40,9 @@ LEAST_BUDGET_S = 0.05
 
 @dataclass(frozen=True, slots=True)
 class Options:
-    """How to solve; see `acquire.recon.reconstruct`. ``budget_s`` is for the whole request.
+    """How to solve. ``budget_s`` is for the whole request.
 
+    Options that are named as parameters of `acquire.recon.reconstruct` are passed to it for each sub-segment.
     ``calibration`` corrects the lines; None leaves them to the cameras' configuration. ``turn`` is a further
     correction of the arms' orientation, ``balance`` the balance by which arm B's light is then divided,
     ``check`` whether unexplained lines are diagnosed, and ``error`` whether the video's error is estimated.
@@ -70,6 +72,11 @@ class Options:
         """Whether the solver can choose prior and weight, and no option overrides its choice."""
         given = (self.bandwidth, self.denoiser)
         return "choice" in SOLVERS.load(self.solver).takes and all(each is None for each in given)
+
+    def keywords(self) -> dict[str, Any]:
+        """Return those options that `reconstruct` has as well, by its names."""
+        taken = signature(reconstruct).parameters
+        return {each.name: getattr(self, each.name) for each in fields(self) if each.name in taken}
 
 
 @dataclass(frozen=True, slots=True)
@@ -140,25 +147,18 @@ def solve(task: Task, watch: Watch) -> Part:
         watch.advance(max(0.0, share - done))
         done = max(done, share)
 
+    keywords = options.keywords()
+    if task.due is not None:
+        keywords["budget_s"] = max(task.due - time.monotonic(), LEAST_BUDGET_S)
     result = reconstruct(
         lines,
         voxels.spatial_merge,
         voxels.temporal_merge,
-        options.preset,
-        options.budget_s if task.due is None else max(task.due - time.monotonic(), LEAST_BUDGET_S),
-        advanced,
-        solver=options.solver,
-        solver_options=options.solver_options,
-        denoiser=options.denoiser,
+        progress=advanced,
         choice=task.choice,
-        iterations=options.iterations,
-        bandwidth=options.bandwidth,
-        dtype=options.dtype,
-        device=options.device,
         stop=watch,
         refuse=False,  # a task that was started ends regularly
-        check=options.check,
-        error=options.error,
+        **keywords,
     )
     # the rest: an early end leaves part of the iterations undone
     watch.advance(1 - done)
