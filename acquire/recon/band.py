@@ -55,15 +55,16 @@ def band_operator(
     basis: Basis,
     spatial_merge: int = 1,
     temporal_merge: int = 1,
+    *,
     alignment: Alignment | None = None,
     blur: Blur | None = None,
 ) -> BandOperator | InBasis:
     """B = Λ′·Dᵀ, by dense factors if these take at most 1 GiB, otherwise by synthesising the video."""
     side = geometry.video_shape(spatial_merge, temporal_merge)[1]
     itemsize = np.dtype(basis.arrays.dtype).itemsize
-    if 2 * geometry.lines * side * basis.count * itemsize <= LARGEST_FACTORS_BYTES:
-        return BandOperator(geometry, code, basis, spatial_merge, temporal_merge, alignment, blur)
-    return InBasis(geometry, code, basis, spatial_merge, temporal_merge, alignment, blur)
+    dense = 2 * geometry.lines * side * basis.count * itemsize <= LARGEST_FACTORS_BYTES
+    make = BandOperator if dense else InBasis
+    return make(geometry, code, basis, spatial_merge, temporal_merge, alignment=alignment, blur=blur)
 
 
 def segment_operator(
@@ -81,8 +82,8 @@ def segment_operator(
         basis,
         spatial_merge,
         temporal_merge,
-        segment.alignment,
-        segment.blur,
+        alignment=segment.alignment,
+        blur=segment.blur,
     )
 
 
@@ -96,6 +97,7 @@ class BandOperator:
         basis: Basis,
         spatial_merge: int = 1,
         temporal_merge: int = 1,
+        *,
         alignment: Alignment | None = None,
         blur: Blur | None = None,
     ) -> None:
@@ -245,6 +247,7 @@ class InBasis:
         basis: Basis,
         spatial_merge: int = 1,
         temporal_merge: int = 1,
+        *,
         alignment: Alignment | None = None,
         blur: Blur | None = None,
     ) -> None:
@@ -252,9 +255,9 @@ class InBasis:
         arrays = basis.arrays
         self._operator: DualArm | GatheredArms
         if arrays.compiled:
-            self._operator = DualArm(*case, np.dtype(arrays.dtype).type, alignment, blur)
+            self._operator = DualArm(*case, np.dtype(arrays.dtype).type, alignment=alignment, blur=blur)
         else:
-            self._operator = GatheredArms(*case, arrays, alignment, blur)
+            self._operator = GatheredArms(*case, arrays, alignment=alignment, blur=blur)
 
     def forward(self, theta: Array) -> Array:
         return self._operator.forward(self._basis.synthesize(theta))

@@ -25,7 +25,7 @@ from acquire.recon.bandwidth import (
     light_beyond,
 )
 from acquire.recon.basis import TemporalBasis, cosine_hz, reachable, resized
-from acquire.recon.beside_motion import BesideMotion, find_lamps
+from acquire.recon.beside_motion import beside_motion, find_lamps
 from acquire.recon.cosines import (
     FEW_FRAMES,
     LAMPS_SHARE,
@@ -243,16 +243,16 @@ def _in_patterns(given: Given, first: InBand) -> Estimate | None:
     basis = TemporalBasis(first.basis.frames, first.basis.cosines, problem.arrays)
     parameters = _for_noise(given, first)
 
-    def begin(kind: type[Refinement], found: Patterns) -> Refinement:
+    def begin(kind: Callable[..., Refinement], found: Patterns) -> Refinement:
         curves = host(first.basis.spread(problem.arrays.asarray(found.curves)))
-        return kind(segment, problem, basis, replace(found, curves=curves), given.merges, parameters)
+        return kind(given, basis, replace(found, curves=curves), parameters)
 
     alone = find_patterns(theta)
     usual = None if alone is None else partial(begin, Refinement, alone)
     rivals: list[Callable[[], Refinement]] = []
     # each refinement of a large segment holds a video's worth of memory
     if not is_large(segment.geometry, given.options.spatial_merge):
-        rivals = [partial(begin, BesideMotion, each) for each in find_lamps(theta, first.basis)]
+        rivals = [partial(begin, beside_motion, each) for each in find_lamps(theta, first.basis)]
     error, noise = problem.prediction_error(first.predict()), given.noise
     explained = max(SOON_EXPLAINED * noise, LEAST_MISSED) if noise < np.inf else LEAST_MISSED  # NaN: unknown
     clock.reset()  # the limit holds for each stage: the first look takes longer where patterns are in doubt

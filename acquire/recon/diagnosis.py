@@ -117,14 +117,14 @@ def _diagnosed(model: LineModel) -> Diagnosis:
     if inquiry.standing is Standing.UNEXPLAINED:
         return Diagnosis(inquiry.standing, sentence, rows)
     if inquiry.standing is Standing.UNCLEAR:
-        return Diagnosis(inquiry.standing, sentence, rows, (), inquiry.described.hypothesis, hypothesis)
+        described = inquiry.described.hypothesis
+        return Diagnosis(inquiry.standing, sentence, rows, hypothesis=described, alternative=hypothesis)
     # the search may have ended under the prior of another hypothesis
     model.fit_prior(hypothesis)
     found = tuple(suspicions(model, hypothesis))
     rival = inquiry.rival if inquiry.standing is Standing.NAMED else None
-    return Diagnosis(
-        inquiry.standing, sentence, rows, found, hypothesis, None if rival is None else rival.hypothesis
-    )
+    alternative = None if rival is None else rival.hypothesis
+    return Diagnosis(inquiry.standing, sentence, rows, found, hypothesis=hypothesis, alternative=alternative)
 
 
 def sentence_of(inquiry: Inquiry) -> str:

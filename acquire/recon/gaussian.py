@@ -13,7 +13,7 @@ them, which is all that is needed here.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import TYPE_CHECKING
 
@@ -88,7 +88,9 @@ class Response:
     and ``finer`` the number of finest row blocks per pixel.
     """
 
-    def __init__(self, code: Floats, rows: int, substeps: int, lines: int, pixels: int, finer: int) -> None:
+    def __init__(
+        self, code: Floats, *, rows: int, substeps: int, lines: int, pixels: int, finer: int
+    ) -> None:
         self.lines, self.pixels, self.finer = lines, pixels, finer
         k = np.arange(FAST)[:, None]
         cosines = np.sqrt(2) * np.cos(np.pi * k * (np.arange(len(code)) + 0.5) / len(code))
@@ -160,12 +162,18 @@ class Model:
         values, vectors = np.linalg.eigh(covariance / unit)
         across = np.linalg.eigh(correlation(pixels, prior.length))
         # rounding of the float32 products leaves eigenvalues slightly below 0
-        return cls(response, prior, vectors, np.maximum(values, 0), across[1], across[0], unit)
+        return cls(
+            response,
+            prior,
+            _vectors=vectors,
+            _values=np.maximum(values, 0),
+            _pixel_vectors=across[1],
+            _pixel_values=across[0],
+            _unit=unit,
+        )
 
     def with_noise(self, noise: float) -> Model:
-        prior = Prior(self.prior.length, self.prior.change, self.prior.fast, noise)
-        kept = self._vectors, self._values, self._pixel_vectors, self._pixel_values, self._unit
-        changed = Model(self.response, prior, *kept)
+        changed = replace(self, prior=replace(self.prior, noise=noise))
         changed.__dict__["_level"] = self._level  # modes do not depend on the noise
         return changed
 

@@ -200,7 +200,7 @@ class LineModel:
         # a multiple of the pixels, since the arms exchange rows and pixels
         finer = max(1, min(rows, MOST_BLOCKS) // self.pixels)
         lit = 1 - code if inverted else code
-        return Response(lit, rows, substeps, self.lines, self.pixels, finer)
+        return Response(lit, rows=rows, substeps=substeps, lines=self.lines, pixels=self.pixels, finer=finer)
 
 
 class View:

@@ -140,7 +140,15 @@ class Stream:
             end_line = first_line - (-frames * T_m // S)
         # a stretch shorter than its lines' exposure has at least one of them
         lines = max(1, min(self.end_line, end_line) - first_line)
-        return SubSegment(stretch.begin, stretch.end, stretch.voxels, first_line, lines, fade_in, fade_out)
+        return SubSegment(
+            stretch.begin,
+            stretch.end,
+            stretch.voxels,
+            first_line=first_line,
+            lines=lines,
+            fade_in=fade_in,
+            fade_out=fade_out,
+        )
 
     def is_slow(self, voxels: Voxels) -> bool:
         """Whether voxels are so long that every row samples them, wherever they are.

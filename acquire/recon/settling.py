@@ -23,7 +23,6 @@ if TYPE_CHECKING:
     from acquire.recon.clock import IterationClock
     from acquire.recon.given import Given
     from acquire.recon.patterns import Refinement
-    from acquire.recon.problem import Problem
 
 LEAST_GAIN = 0.003
 """Smallest relative gain of the held-out prediction for which a round counts as an improvement."""
@@ -60,7 +59,7 @@ must predict better: first they have to take up the light of the others."""
 
 def settle(given: Given, refinement: Refinement) -> Refinement:
     """Refine until the held-out samples are predicted no better, or the clock ends it: the best state."""
-    clock, course = given.clock, _Course(refinement, given.problem)
+    clock, course = given.clock, _Course(given, refinement)
     course.refine_until_idle(clock, LOOSENED_IN_VAIN, EARLY_ROUNDS * ROUND)
     course.continue_with(_without_superfluous(given, course.refinement))
     if course.refine_until_idle(clock, LOOSENED_IN_VAIN, TRIAL_AFTER * ROUND):
@@ -86,14 +85,14 @@ class _Course:
     tells whether the last round met the used samples more closely than their noise allows, if it is known.
     """
 
-    def __init__(self, refinement: Refinement, problem: Problem) -> None:
-        self.refinement, self._problem = refinement, problem
-        self._noise, self.fits_noise = problem.noise(refinement.segment), False
+    def __init__(self, given: Given, refinement: Refinement) -> None:
+        self.refinement, self._problem = refinement, given.problem
+        self._noise, self.fits_noise = given.noise, False
         self.recent = self.before = np.inf
         self._best, self._kept, self._idle = np.inf, (refinement, refinement.found), 0
         self._loosened = [(np.inf, refinement.parameters.tv_weight)]
         # an RMS of N values has a relative standard error of 1/√(2N)
-        self._doubt = SURE / np.sqrt(2 * max(1, problem.held_out.sum()))
+        self._doubt = SURE / np.sqrt(2 * max(1, given.problem.held_out.sum()))
 
     def refine_until_idle(self, clock: IterationClock, patience: int, most: int | None = None) -> bool:
         """Refine until this many rounds in turn gain nothing; False if it ends before, after ``most``."""

@@ -62,7 +62,14 @@ def solve_twist(given: Given, *, banded: bool) -> Estimate:
     basis = TemporalBasis(shape[0], count, problem.arrays)
     # with all cosines, the shear is less work than dense factors
     make = band_operator if banded else InBasis
-    operator = make(segment.geometry, segment.code, basis, *given.merges, segment.alignment, segment.blur)
+    operator = make(
+        segment.geometry,
+        segment.code,
+        basis,
+        *given.merges,
+        alignment=segment.alignment,
+        blur=segment.blur,
+    )
     parameters = TwistParameters()
     if options.tv_weight is not None:
         parameters = replace(parameters, tv_weight=options.tv_weight)

@@ -37,9 +37,9 @@ def save_reconstruction(
         path,
         result.video,
         result.time_ns,
-        float(spatial_merge),
-        interval_ns,
-        provenance,
+        pixel_size=float(spatial_merge),
+        frame_interval_ns=interval_ns,
+        provenance=provenance,
         pixel_unit=None,
         origin=(begin_s, centre, centre),
     )

@@ -6,6 +6,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
+from recon_cases import given_for
 from scipy.fft import dct
 
 from acquire.evaluate.metrics import psnr
@@ -13,8 +14,6 @@ from acquire.forward import DualArm
 from acquire.recon import Reconstruction, blinking, reconstruct
 from acquire.recon.aliasing import detect_unresolved_light, name_gaps
 from acquire.recon.clock import IterationClock
-from acquire.recon.given import Given
-from acquire.recon.options import SolveOptions
 from acquire.recon.problem import build_problem
 from acquire.sim.procedural import Recorded, record
 
@@ -52,8 +51,7 @@ def held_against(recorded: Recorded, result: Reconstruction, clock: IterationClo
     lines = DualArm(segment.geometry, segment.code, 3, 1).forward(result.video.astype(np.float32))
     predicted = lines / (problem.norm * problem.scale)
     resolved_hz = result.parameters["resolved_hz"]
-    options = SolveOptions(spatial_merge=3, temporal_merge=1, solver="admm", iterations=1)
-    given = Given(segment, problem, options, clock)
+    given = given_for(segment, problem, (3, 1), clock=clock)
     return detect_unresolved_light(given, predicted, result.video, resolved_hz)
 
 

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from recon_cases import given_for
 
 from acquire.arrays import Arrays
 from acquire.codes import prbs
@@ -17,7 +18,7 @@ from acquire.recon import blinking, reconstruct, settling
 from acquire.recon.admm import Admm, AdmmParameters
 from acquire.recon.band import band_operator
 from acquire.recon.basis import LearnedBasis, TemporalBasis
-from acquire.recon.beside_motion import BesideMotion, find_lamps
+from acquire.recon.beside_motion import beside_motion, find_lamps
 from acquire.recon.clock import IterationClock
 from acquire.recon.joined import JoinedOperator, JoinedPrior, JoinedSign, Layout
 from acquire.recon.patterns import ROUND
@@ -150,7 +151,8 @@ def test_a_refinement_keeps_both_parts_when_it_returns_continues_and_drops_a_pat
     frames = given.segment.geometry.span
     theta = TemporalBasis(frames, 40).analyze(merge_video(given.light, 2, 1) / problem.scale)
     found = find_lamps(theta, TemporalBasis(frames, 40))[0]
-    refinement = BesideMotion(given.segment, problem, TemporalBasis(frames, 40), found, (2, 1))
+    asked = given_for(given.segment, problem, (2, 1))
+    refinement = beside_motion(asked, TemporalBasis(frames, 40), found)
     for _ in range(2 * ROUND):
         refinement.step()
     kept, video, lines = refinement.found, refinement.video(), refinement.predict()

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
+from recon_cases import given_for
 
 from acquire.arrays import host
 from acquire.evaluate.metrics import psnr
@@ -15,9 +16,7 @@ from acquire.lines import Segment
 from acquire.recon import cosines, pursuit, reconstruct
 from acquire.recon.bandwidth import FEWEST_COEFFICIENTS, MARGIN
 from acquire.recon.basis import LearnedBasis, TemporalBasis, reachable
-from acquire.recon.clock import IterationClock
 from acquire.recon.given import Given
-from acquire.recon.options import SolveOptions
 from acquire.recon.problem import build_problem
 from acquire.recon.pursuit import pursue, widened
 from acquire.sim.procedural import record
@@ -27,13 +26,11 @@ if TYPE_CHECKING:
 
     from acquire.recon.estimates import InBand
 
-OPTIONS = SolveOptions(spatial_merge=3, temporal_merge=1, solver="admm", iterations=150)
-
 
 @cache
 def posed(scene: str, seed: int) -> Given:
     segment = record(scene, seed, stages=32, lines=200).segment
-    return Given(segment, build_problem(segment, 3, 1, hold_out=0.08), OPTIONS, IterationClock(150))
+    return given_for(segment, build_problem(segment, 3, 1, hold_out=0.08), (3, 1))
 
 
 def without_limit(_: InBand, most: int) -> Iterator[int]:
@@ -102,7 +99,7 @@ def test_a_short_video_has_no_fast_cosines_to_look_for(monkeypatch: pytest.Monke
     leds = posed("leds", 61)
     T_m = leds.segment.geometry.span // 40
     problem = build_problem(leds.segment, 3, T_m, hold_out=0.08)
-    coarse = replace(leds, problem=problem, options=replace(OPTIONS, temporal_merge=T_m))
+    coarse = replace(leds, problem=problem, options=replace(leds.options, temporal_merge=T_m))
     assert pursue(coarse, without_limit, lambda: 0) is None
 
 

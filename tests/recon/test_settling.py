@@ -23,7 +23,6 @@ class Scripted:
     loosens: bool = True
     at_round_end: bool = True
     found: object = None
-    segment: object = None
     held_at: list[float] = field(default_factory=list)
     done: int = 0
 
@@ -43,11 +42,11 @@ class Scripted:
 def course(*rounds: tuple[float, float, float], noise: float = NOISE) -> _Course:
     problem = SimpleNamespace(
         held_out=np.ones(HELD_OUT, np.bool_),
-        noise=lambda segment: noise,
         prediction_error=lambda predicted: predicted[1],
         misfit=lambda predicted: predicted[2],
     )
-    made: Any = _Course(Scripted(list(rounds)), problem)  # type: ignore[arg-type]
+    given: Any = SimpleNamespace(problem=problem, noise=noise)
+    made: Any = _Course(given, Scripted(list(rounds)))  # type: ignore[arg-type]
     clock: Any = SimpleNamespace(
         iterations=len(rounds), run=lambda most, *stage, **of_stage: range(min(most, len(rounds)))
     )
