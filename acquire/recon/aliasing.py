@@ -35,15 +35,15 @@ SHARE = 0.5
 DAMPING = 0.1
 """Damping relative to the mean eigenvalue: cosines that the lines hardly see would absorb all that is
 left."""
-WINDOW, OFTEN, STANDS_ALONE = 101, 90, 6.5
+RIVALS, OFTEN, STANDS_ALONE = 101, 90, 6.5
 """Number of neighbouring cosines, the percentile of theirs that is usual, and the ratio to it above which
 light is detected: 35 for a lamp of 20 kHz with a pattern of its own, up to 4.4 where there is none; 3.6 for
 one of 3 % of a textured picture's area, which is missed."""
-MARGIN = 1.25
+CLEAR_OF_BAND = 1.25
 """Start of the search relative to the end of the band: what is just beyond it belongs to its end."""
-SECONDS, SPAN = 2.0, 980
+SEARCH_S, SEARCHED_SPAN = 2.0, 980
 """Processor time for this number of sub-steps; it grows with their cube."""
-LARGEST_SPAN = 2048
+LONGEST_SEARCHED = 2048
 """Largest number of sub-steps: up to here it is about a tenth of a reconstruction's time, at 2900 a third."""
 
 
@@ -69,22 +69,22 @@ def unresolved_hz(
     there is no time for the search, or if the segment is long.
     """
     segment, problem, span = given.segment, given.problem, given.segment.geometry.span
-    if span > LARGEST_SPAN or not given.clock.affords(SECONDS * (span / SPAN) ** 3):
+    if span > LONGEST_SEARCHED or not given.clock.affords(SEARCH_S * (span / SEARCHED_SPAN) ** 3):
         return None
     rate_hz = 1e9 / segment.substep_ns
     # cosine k of the sub-steps is light of k·rate/(2·span)
-    first = int(np.ceil(MARGIN * resolved_hz * 2 * span / rate_hz))
+    first = int(np.ceil(CLEAR_OF_BAND * resolved_hz * 2 * span / rate_hz))
     count = int(SHARE * span)
     residual = np.where(problem.usable, problem.samples - predicted, 0)
     patterns = _patterns(video, segment.geometry.size)
     # without a window of cosines beyond the band there is nothing that light could stand out of
-    if first + WINDOW > count or not patterns or not residual.any():
+    if first + RIVALS > count or not patterns or not residual.any():
         return None
     basis = TemporalBasis(span, count)
     # a lamp may be in several patterns, each with a curve of its own: the energies add up
     energy = sum((_energy(segment, each, residual, basis) for each in patterns), np.zeros(count))
     usual = np.maximum(
-        percentile_filter(energy, OFTEN, WINDOW, mode="nearest"), np.percentile(energy[first:], OFTEN)
+        percentile_filter(energy, OFTEN, RIVALS, mode="nearest"), np.percentile(energy[first:], OFTEN)
     )
     highest = first + int(np.argmax((energy / usual)[first:]))
     return highest * rate_hz / (2 * span) if energy[highest] > STANDS_ALONE * usual[highest] else None

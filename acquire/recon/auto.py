@@ -21,10 +21,10 @@ if TYPE_CHECKING:
     from acquire.lines import Segment
 
 TEMPORAL_MERGES = (64, 16, 4, 1)
-ITERATIONS = 40
+TEMPO_ITERATIONS = 40
 BETTER = 1.25
 """Factor by which shorter frames must explain the lines better to be chosen: they cost accuracy elsewhere."""
-EXPLAINED = 0.015
+GOOD_ENOUGH = 0.015
 """Relative error below which nothing shorter is tried."""
 
 
@@ -66,7 +66,7 @@ def tempo(
     done()
     best, chosen = still, Voxels(1, geometry.span)
     for merge in TEMPORAL_MERGES:
-        if best <= EXPLAINED:
+        if best <= GOOD_ENOUGH:
             break
         error = _error(segment, Voxels(side, merge))
         tried.append((merge, error))
@@ -87,7 +87,7 @@ def _error(segment: Segment, voxels: Voxels) -> float:
         voxels.spatial_merge,
         voxels.temporal_merge,
         "fast",
-        iterations=ITERATIONS,
+        iterations=TEMPO_ITERATIONS,
         check=False,
         error=False,
     ).quality

@@ -23,7 +23,7 @@ from acquire.arrays import host
 from acquire.recon.admm import Admm, AdmmParameters
 from acquire.recon.band import segment_operator
 from acquire.recon.basis import TemporalBasis, reachable
-from acquire.recon.lamps import last_lamp, search_seconds
+from acquire.recon.lamps import WINDOW, last_lamp, search_seconds
 from acquire.recon.problem import build_problem
 
 if TYPE_CHECKING:
@@ -40,14 +40,14 @@ COARSE_SIDE = 24
 HELD_BY = 3
 """Largest number of stages across a coarse voxel for which the floor is low enough without a search for lamps
 (M = 72) in a slow scene: there it took a bullet and a runner for lamps."""
-ITERATIONS, FEWEST_ITERATIONS = 12, 10
+TENTATIVE_ITERATIONS, FEWEST_TENTATIVE = 12, 10
 PEAK = 25.0
 """Largest ratio of the floor's highest coefficient to its median: 5 to 15 for a floor, more for light."""
 MARGIN = 1.25
 FEWEST_COEFFICIENTS = 32
-WINDOW, STANDS_OUT = 61, 9.0
-"""Number of neighbouring cosines whose median is the floor, and the ratio to it above which light is
-detected; residuals without light reach 5 to 8."""
+STANDS_OUT = 9.0
+"""Ratio to the median of the neighbouring cosines (`WINDOW`) above which light is detected; residuals without
+light reach 5 to 8."""
 LARGEST_SHARE, FASTEST_SHARE = 0.25, 0.5
 """Share of the sub-steps' cosines that a band may have, and in which single lamps are looked for."""
 
@@ -149,8 +149,8 @@ def _tentative(
     operator = problem.masked(segment_operator(segment, basis, merge, temporal_merge))
     parameters = AdmmParameters(grid_per_coefficient=1)
     solver = Admm(operator, problem.used_samples, (count, side, side), basis, parameters)
-    for made in range(ITERATIONS):
-        if made >= FEWEST_ITERATIONS and hurry():
+    for made in range(TENTATIVE_ITERATIONS):
+        if made >= FEWEST_TENTATIVE and hurry():
             break
         solver.step()
     return host(solver.theta)

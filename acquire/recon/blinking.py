@@ -37,7 +37,7 @@ from acquire.recon.cosines import (
 from acquire.recon.estimates import InBand, Refined
 from acquire.recon.patterns import PARAMETERS, ROUND, Refinement, find_patterns
 from acquire.recon.pursuit import pursue, widened
-from acquire.recon.settling import CLEARLY, better_than, early_error, has_time, settle
+from acquire.recon.settling import BETTER_BESIDE_MOTION, better_than, early_error, has_time, settle
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
@@ -65,7 +65,7 @@ SOON_EXPLAINED = 1.5
 """Held-out error of patterns after their first rounds, relative to the noise, up to which nothing moves."""
 PLAIN_ITERATIONS = 90
 """Number of iterations for scenes without patterns: more of them fit what voxels cannot represent."""
-EXPLAINED = 0.1
+AT_REST = 0.1
 """Relative prediction error below which they do, and below which cosines start from a still."""
 FREER = 0.85
 """Largest error of cosines that are no patterns, relative to that of a still, a volume or fewer cosines, for
@@ -208,7 +208,7 @@ def _solve_glance(given: Given, count: int, still: Array | None) -> InBand:
     for _ in given.clock.run(_at_most(GLANCE, given), "first look", FIRST_LOOK_SHARE, estimate.video):
         estimate.solver.step()
     few = 1 < frames <= FEW_FRAMES
-    if few and problem.prediction_error(estimate.predict()) < EXPLAINED:
+    if few and problem.prediction_error(estimate.predict()) < AT_REST:
         # freed of the high penalties, few frames at rest reached 36 dB instead of 21
         estimate = begin_in_cosines(given, basis, estimate.solver.theta, explained=True)
     return estimate
@@ -285,7 +285,7 @@ def _beside_motion(
     """Patterns beside something that moves, unless the ``usual`` ones soon predict to ``enough``."""
     soon = np.inf if usual is None else early_error(given, usual())
     if soon > enough:
-        return better_than(given, CLEARLY * soon, rivals)
+        return better_than(given, BETTER_BESIDE_MOTION * soon, rivals)
     given.clock.reset()
     return None
 

@@ -23,9 +23,9 @@ if TYPE_CHECKING:
     from acquire.lines import Segment
     from acquire.recon.problem import Problem
 
-RIDGE = 1e-3
+START_RIDGE = 1e-3
 """Ridge of the start relative to the mean eigenvalue: it draws g to 1 where no line has information on it."""
-EVIDENCE_STEPS = 12
+MOST_STEPS = 12
 NEIGHBOURS = 9
 """Number of neighbouring cosines that share their energy: the light of one lamp is rarely in a single one."""
 FAINTEST = 1e-10
@@ -109,10 +109,10 @@ def _most_likely(
     """
     diagonal = np.diag_indices_from(normal)
     damped, mean_eigenvalue = normal.copy(), np.trace(normal) / len(normal)
-    damped[diagonal] += RIDGE * mean_eigenvalue
+    damped[diagonal] += START_RIDGE * mean_eigenvalue
     x: NDArray[np.float64] = np.asarray(np.linalg.solve(damped, right), np.float64)
     share, noise = np.full(len(x), np.square(x).mean()), energy / samples
-    for _ in range(EVIDENCE_STEPS):
+    for _ in range(MOST_STEPS):
         if share.max() < FAINTEST**2 or not noise > 0:
             break  # g is 1, or explains the lines exactly
         precision = noise / np.maximum(share, FAINTEST * share.max())

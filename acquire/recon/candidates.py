@@ -31,7 +31,7 @@ LEAST_PACE, LARGEST_PACE = 0.25, 64.0
 LEAST_WEIGHT, LARGEST_WEIGHT = 1e-7, 1e3
 WEIGHT_STEP, PACE_STEP = 10**0.5, 4.0
 USUAL_FRAMES, USUAL_ENERGY = 980, 7.1e-3
-"""Number of frames and response to a voxel in Fig. 9, for which the candidates' weights are given."""
+"""Number of frames and response to a voxel in Fig. 9, for which weights are given."""
 
 
 @dataclass(frozen=True, slots=True)

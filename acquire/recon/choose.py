@@ -22,7 +22,7 @@ import numpy as np
 
 from acquire.arrays import host
 from acquire.recon.blinking import (
-    EXPLAINED,
+    AT_REST,
     FIRST_LOOK_SHARE,
     FREER,
     GLANCE,
@@ -41,7 +41,7 @@ from acquire.recon.patterns import find_patterns
 from acquire.recon.reuse import reuse_choice
 from acquire.recon.solver import Preset, Solver
 from acquire.recon.still import best_still, change_bench, weighted_like
-from acquire.recon.workbench import BRIGHTER, FIRST_ITERATIONS, LEAST_GAIN, SEARCH_SHARE, Workbench
+from acquire.recon.workbench import BRIGHTER, FIRST_ITERATIONS, GAIN_OF_WEAKER, SEARCH_SHARE, Workbench
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -63,14 +63,14 @@ FAR = 1.25
 SMOOTHER = 0.85
 """Largest error of a smooth volume, relative to the volume's, for which it is preferred: a quadratic prior
 admits more noise that does not show."""
-CLEARLY = 0.97
+MOVING = 0.97
 """Largest error of a volume, relative to a still's, for which it is preferred; the change from a still equals
 the still where its prior is strong, and need only be better."""
 REPEATS = 0.8
 """Largest error of a cycle, relative to the volume's, the still's and the cosines' at a glance, for which it
 is a candidate: a video that repeats itself claims more than any other. Motion that repeats has 0.4 to 0.7,
 text that scrolls 0.9."""
-CLOSE, DOUBTFUL = 1.1, 2.0
+CLOSE, NOT_FAR = 1.1, 2.0
 """Largest error of the cosines, relative to the best trial's, for which they are continued, and for which
 they are if clear patterns were found, or if only a glance was taken."""
 
@@ -118,7 +118,7 @@ def _choose(bench: Workbench, volume: Trial, trials: int) -> Estimate:
     """
     given, clock = bench.given, bench.clock
     plain = bench.attempt(bench.fitting(STILL), FIRST_ITERATIONS)
-    at_rest = plain.error < EXPLAINED and not bench.held_out.clearly_less(volume.errors, plain.errors)
+    at_rest = plain.error < AT_REST and not bench.held_out.clearly_less(volume.errors, plain.errors)
     cosines = glance(given, plain.coefficients if at_rest else None)
     # taken now, because the trials below forget how long the cosines' iterations are
     rest_s = (LONGER_LOOK - GLANCE) * clock.longest_s
@@ -145,7 +145,7 @@ def _choose(bench: Workbench, volume: Trial, trials: int) -> Estimate:
             if (clear or isinstance(refined, Refined)) and _wins(bench, refined, tried.best):
                 return Preferred(refined, bench.record)
     best = _search(bench, tried, trials, bench.error(cosines.predict()) if ahead else np.inf)
-    near = at_a_glance < DOUBTFUL * best.error and clock.affords(rest_s, FIRST_LOOK_SHARE)
+    near = at_a_glance < NOT_FAR * best.error and clock.affords(rest_s, FIRST_LOOK_SHARE)
     if not ahead and near:
         complete_look(given, cosines)
     if refined is None and (ahead or near) and _worth_refining(bench, cosines, best):
@@ -200,7 +200,7 @@ def _search(bench: Workbench, tried: _Tried, trials: int, rival: float) -> Trial
     if bright is not None and flickers and bright.error < BRIGHTER * volume.error:
         volume = bright
     if plain.error < FAR * volume.error:
-        explains = plain.error < EXPLAINED
+        explains = plain.error < AT_REST
         merge = bench.given.options.spatial_merge
         still = best_still(plain, trials, merge=merge) if explains else bench.climb(plain, trials)
     # where much moves, the still was not searched further, and is no ground for a change
@@ -222,7 +222,7 @@ def _search(bench: Workbench, tried: _Tried, trials: int, rival: float) -> Trial
         smooth.errors, still.errors
     )
     moving = smooth if flows else volume
-    most = 1 - LEAST_GAIN if moving.candidate.change else CLEARLY
+    most = 1 - GAIN_OF_WEAKER if moving.candidate.change else MOVING
     return moving if moving.error < most * still.error else still
 
 
@@ -231,7 +231,7 @@ def _worth_refining(bench: Workbench, cosines: InBand, best: Trial) -> bool:
     error = bench.error(cosines.predict())
     if error < CLOSE * best.error:
         return True
-    return error <= DOUBTFUL * best.error and _has_clear_patterns(cosines)
+    return error <= NOT_FAR * best.error and _has_clear_patterns(cosines)
 
 
 def _error(trial: Trial) -> float:

@@ -10,6 +10,7 @@ from acquire.recon.admm import Admm, AdmmParameters
 from acquire.recon.band import segment_operator
 from acquire.recon.bandwidth import FEWEST_COEFFICIENTS, estimate_coefficients
 from acquire.recon.basis import cosine_hz
+from acquire.recon.candidates import USUAL_FRAMES
 from acquire.recon.estimates import InBand
 
 if TYPE_CHECKING:
@@ -24,11 +25,10 @@ LAMPS_SHARE = 0.3
 # 0.2 was a cliff on a busy host, where posing alone may take as much
 UNSEARCHED_SHARE = 0.4
 """Share of the budget that posing the problem may take; beyond it, the bandwidth is not searched for."""
-USUAL_FRAMES = 980
 FEW_FRAMES = 32
 HELD_BACK = 100.0
 """Factor of the penalties for few frames unless they explain the lines."""
-STILL = AdmmParameters(tv_weight=5e-6, tv_penalty=1e-5, sign_penalty=3e-6, gradient_steps=6)
+STILL_PARAMETERS = AdmmParameters(tv_weight=5e-6, tv_penalty=1e-5, sign_penalty=3e-6, gradient_steps=6)
 """Parameters for a single frame. All sub-steps add up in it, so that the mean light has an eigenvalue some
 thousand times that of a detail: lower penalties admit details, and more gradient steps reach them."""
 
@@ -83,7 +83,7 @@ def parameters_for(frames: int, *, explained: bool = False) -> AdmmParameters:
     they do (``explained``), the scene is at rest and is solved as a still is.
     """
     if frames == 1:
-        return STILL
+        return STILL_PARAMETERS
     usual = AdmmParameters()
     threshold = usual.tv_weight / usual.tv_penalty * min(1.0, frames / USUAL_FRAMES) ** 0.5
     penalty = usual.tv_penalty * (HELD_BACK if frames <= FEW_FRAMES and not explained else 1.0)
@@ -92,5 +92,5 @@ def parameters_for(frames: int, *, explained: bool = False) -> AdmmParameters:
         tv_weight=threshold * penalty,
         tv_penalty=penalty,
         sign_penalty=usual.sign_penalty * penalty / usual.tv_penalty,
-        gradient_steps=STILL.gradient_steps if explained else usual.gradient_steps,
+        gradient_steps=STILL_PARAMETERS.gradient_steps if explained else usual.gradient_steps,
     )

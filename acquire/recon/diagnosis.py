@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
     from acquire.lines import Segment
 
-FEWEST_LINES, FEWEST_STAGES = 24, 4
+FEWEST_DIAGNOSED, FEWEST_STAGES = 24, 4
 """Fewest lines and stages for which anything is claimed."""
 TURNED = {
     Turn(pixels=True): "arm B is mirrored: its pixels are in the other order, or arm A's rows are",
@@ -94,7 +94,7 @@ def diagnose(segment: Segment, bits: Callable[[int, int], NDArray[np.uint8]] | N
     nothing = unusable(segment)
     if nothing:
         return Diagnosis(Standing.UNCLEAR, "the lines cannot be compared with their code", (), tuple(nothing))
-    if segment.geometry.lines < FEWEST_LINES or segment.geometry.stages < FEWEST_STAGES:
+    if segment.geometry.lines < FEWEST_DIAGNOSED or segment.geometry.stages < FEWEST_STAGES:
         few = f"{segment.geometry.lines} lines of {segment.geometry.stages} pixels are too few to tell"
         return Diagnosis(Standing.UNCLEAR, few)
     # the matrices are small: more threads would wait for each other

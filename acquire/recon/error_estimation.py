@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from acquire.recon.problem import Problem
     from acquire.recon.result import Quality
 
-ITERATIONS = 15
+EXTRA_ITERATIONS = 15
 """Number of extra iterations used to estimate the error."""
 RESERVED_ITERATIONS = 18.0
 """Time reserved in a budget for the estimate, in iterations of the solver; fewer extra ones fit into it."""
@@ -92,7 +92,7 @@ def estimate_error(
         residual * white,
         trusted,
         exponents,
-        growth=(ITERATIONS / continued.made) ** continued.growth,
+        growth=(EXTRA_ITERATIONS / continued.made) ** continued.growth,
         drift=continued.drift,
         fine=fine,
     )
@@ -109,7 +109,7 @@ def _with_fewer_lines(problem: Problem, estimate: Continuable, clock: IterationC
     if continuation is None:
         return UNSUPPORTED
     made = 0
-    for made, _ in enumerate(clock.run_reserved(ITERATIONS), 1):  # noqa: B007 (the count is used after the loop)
+    for made, _ in enumerate(clock.run_reserved(EXTRA_ITERATIONS), 1):  # noqa: B007 (the count is used after the loop)
         continuation.step()
     return Continued(continuation.video(), made, GROWTH) if made >= FEWEST else NO_TIME
 
@@ -122,7 +122,7 @@ def _under_heavier_prior(
     continuation = estimate.continue_with(problem, HEAVIER, still=True)
     if distances is None or continuation is None:
         return UNSUPPORTED
-    made, most = 0, max(distances, default=ITERATIONS)
+    made, most = 0, max(distances, default=EXTRA_ITERATIONS)
     reserved = clock.run_reserved(max(most, FEWEST_HEAVIER), FEWEST_HEAVIER)
     for made, _ in enumerate(reserved, 1):  # noqa: B007 (the count is used after the loop)
         continuation.step()
@@ -160,7 +160,7 @@ def _drift_distances(
         return rms_of(shown)
 
     made = 0
-    for made, _ in enumerate(clock.run_reserved(ITERATIONS, repeat=2 * EARLY[0]), 1):
+    for made, _ in enumerate(clock.run_reserved(EXTRA_ITERATIONS, repeat=2 * EARLY[0]), 1):
         continuation.step()
         if made in EARLY:
             distances[made] = distance()

@@ -28,7 +28,7 @@ FINE, SLOW, FAST = 4, 16, 128
 """Numbers of cosines that are resolved in fine rows, in rows as wide as pixels, and in few rows: sharp edges
 at rest would look like a delay if they fell between blocks."""
 FAST_ROWS = 16
-BLOCK_LINES = 24
+EVIDENCE_LINES = 24
 """Length of the blocks of lines in which evidence is counted; their spread gives its uncertainty."""
 SMALLEST = 1e-30
 
@@ -213,7 +213,7 @@ class Model:
         values, pulled = self._vectors @ rest, self._vectors @ (rest / self._variance)
         per_line = (values * pulled).sum(1) / scale
         constant = (np.log(self._variance).sum() + rest.size * np.log(scale)) / lines
-        edges = np.linspace(0, lines, max(1, round(lines / BLOCK_LINES)) + 1).round().astype(int)
+        edges = np.linspace(0, lines, max(1, round(lines / EVIDENCE_LINES)) + 1).round().astype(int)
         evidence = np.asarray(-0.5 * np.add.reduceat(per_line + constant, edges[:-1]))
         return Fit(rest, float(amounts[0]), scale, evidence, amount)
 

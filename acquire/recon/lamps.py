@@ -40,17 +40,18 @@ if TYPE_CHECKING:
     from acquire.lines import Segment
     from acquire.recon.problem import Problem
 
-ITERATIONS, FEWEST_ITERATIONS = 5, 3
+LIKELIHOOD_STEPS, FEWEST_STEPS = 5, 3
+"""Number of steps towards the largest likelihood, and of those that are made in a hurry."""
 WINDOW, PEAK_WIDTH = 61, 3
 """Number of neighbouring cosines whose median is the floor, and number over which the light of a lamp
 spreads."""
 FALSE_ALARMS = 1e-3
 """Share of searches that mistake chance for light, if the logarithms about the floor were normal."""
-USUAL = 0.9
+SCATTER_QUANTILE = 0.9
 """Quantile that measures their upward scatter."""
-LONGEST = 520
+LONGEST_PART = 520
 """Largest number of lines that are analysed together: the time grows with their square."""
-SECONDS = 6e-10
+SECONDS_EACH = 6e-10
 """Processor time for each cosine, row and pair of lines."""
 LARGEST_FACTOR_BYTES, CHUNK_BYTES = 1 << 29, 1 << 26
 LEAST_NOISE = 1e-7
@@ -65,10 +66,10 @@ FEWEST_LOOKED_AT = 128
 
 def search_seconds(geometry: Geometry, temporal_merge: int, share: float) -> float:
     """Approximate processor time of `last_lamp`."""
-    parts = -(-geometry.lines // LONGEST)
+    parts = -(-geometry.lines // LONGEST_PART)
     one = replace(geometry, lines=-(-geometry.lines // parts))
     cosines = share * one.video_shape(1, temporal_merge)[0]
-    return float(SECONDS * parts * cosines * one.stages * one.lines**2)
+    return float(SECONDS_EACH * parts * cosines * one.stages * one.lines**2)
 
 
 def last_lamp(
@@ -85,7 +86,9 @@ def last_lamp(
     """
     frames = segment.geometry.video_shape(1, temporal_merge)[0]
     last = 0.0
-    for lines in np.array_split(np.arange(segment.geometry.lines), -(-segment.geometry.lines // LONGEST)):
+    for lines in np.array_split(
+        np.arange(segment.geometry.lines), -(-segment.geometry.lines // LONGEST_PART)
+    ):
         geometry = replace(segment.geometry, lines=len(lines))
         first = int(lines[0]) * geometry.substeps
         code = segment.code[first : first + geometry.span]
@@ -124,7 +127,7 @@ def _relative_energy(
     light, noise = 0.5 * L / (K * response), 1e-3
     chunk = max(1, CHUNK_BYTES // (4 * rows * L))
     chunks = [slice(k, k + chunk) for k in range(0, K, chunk)]
-    for made in range(ITERATIONS):
+    for made in range(LIKELIHOOD_STEPS):
         inverse = _inverse(factor, chunks, light, noise)
         white = _whitened(inverse, pixels, seen)
         explained, expected = np.empty(K), np.empty(K)
@@ -143,7 +146,7 @@ def _relative_energy(
         light *= np.sqrt(explained / (samples_each * expected))
         left = np.square(white, dtype=np.float64).sum() / samples_each
         noise = max(LEAST_NOISE, noise * float(np.sqrt(left / trace)))
-        if made + 1 >= FEWEST_ITERATIONS and hurry():
+        if made + 1 >= FEWEST_STEPS and hurry():
             break
     inverse = _inverse(factor, chunks, light, noise)
     white = _whitened(inverse, pixels, seen)
@@ -217,6 +220,6 @@ def _end_of_peaks(energy: NDArray[np.float64], most: int) -> int:
         return 0
     level = np.log(uniform_filter1d(energy, PEAK_WIDTH, mode="nearest"))
     level -= median_filter(level, WINDOW, mode="nearest")
-    spread = np.quantile(level, USUAL) / ndtri(USUAL)
+    spread = np.quantile(level, SCATTER_QUANTILE) / ndtri(SCATTER_QUANTILE)
     above = np.flatnonzero(level[:most] > ndtri(1 - FALSE_ALARMS / len(level)) * spread)
     return int(above[-1]) + 1 if len(above) else 0

@@ -29,7 +29,7 @@ SPIKE_LEVEL = 0.5
 FENCE = 1.5
 """Distance of a spike from the middle half of its column's samples, in their range (Tukey's inner fences)."""
 HOT_RATIO = 10.0
-STEADY = 0.5 / 3**0.5
+DEFECT_SPREAD = 0.5 / 3**0.5
 """Relative standard deviation of a hot column's lines at most, times √M: light under a random code varies by
 1/√(S·M) if it fills all rows, as a slit, and more if it fills fewer; defects need not vary at all."""
 FEWEST_VARYING = 0.1
@@ -81,7 +81,9 @@ def _hot(samples: NDArray[np.float64], left: NDArray[np.bool_]) -> NDArray[np.bo
 
     # A lamp or a slit on dark ground is in few columns, too. It follows the code, and both arms see all of
     # its light: their totals agree better with it than without it. By medians, which spikes do not change.
-    follows = bright & (samples.std(axis=1, keepdims=True) > STEADY / samples.shape[2] ** 0.5 * medians)
+    follows = bright & (
+        samples.std(axis=1, keepdims=True) > DEFECT_SPREAD / samples.shape[2] ** 0.5 * medians
+    )
     total, without = medians.sum(axis=2, keepdims=True), (medians * ~follows).sum(axis=2, keepdims=True)
     with np.errstate(divide="ignore", invalid="ignore"):
         seen_by_both = np.abs(np.log(total / total[::-1])) < np.abs(np.log(without / total[::-1]))

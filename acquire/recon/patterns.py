@@ -70,11 +70,11 @@ by frame, faint patterns lose their edges in the noise, the curves take up the e
 2 dB lower."""
 ROUND = 5
 """Number of ADMM iterations between two fits of the curves."""
-RIDGE = 3e-3
+CURVE_DAMPING = 3e-3
 """Levenberg's damping of the curves' fit: it slows the curves down, so that the patterns can follow, and does
 not change the fixed point. With a tenth of it the two chase each other and diverge from the truth."""
-PENALTY_DECAY, LEAST_PENALTY = 0.8, 1 / 4
-WEIGHT_DECAY, LEAST_WEIGHT = 0.75, 1 / 16
+PENALTY_DECAY, LAST_PENALTY = 0.8, 1 / 4
+WEIGHT_DECAY, LAST_WEIGHT = 0.75, 1 / 16
 """Factors of the penalties ρ and of λ from round to round, and their limits: weights that stabilise the
 iterates while patterns and curves are wrong would flatten them once they are right."""
 
@@ -254,7 +254,7 @@ class Refinement:
     def _new_fit(self) -> CurveFit:
         given = self._given
         merge = given.options.temporal_merge
-        return CurveFit(given.segment, given.problem, self._cosines, merge, RIDGE, learns=True)
+        return CurveFit(given.segment, given.problem, self._cosines, merge, CURVE_DAMPING, learns=True)
 
     @property
     def _theta(self) -> Array:
@@ -279,7 +279,7 @@ class Refinement:
             self._admm.rebase(*self._operators(), self._theta)
             self._take()
             if self.loosens:
-                weight = max(WEIGHT_DECAY * self.parameters.tv_weight, LEAST_WEIGHT * self._first.tv_weight)
+                weight = max(WEIGHT_DECAY * self.parameters.tv_weight, LAST_WEIGHT * self._first.tv_weight)
                 self._reweigh(weight)
 
     def hold(self, weight: float) -> None:
@@ -290,7 +290,7 @@ class Refinement:
     def _reweigh(self, weight: float) -> None:
         """Set λ, and lower the penalties by one step."""
         now, first = self.parameters, self._first
-        penalty = max(PENALTY_DECAY * now.tv_penalty, LEAST_PENALTY * first.tv_penalty)
+        penalty = max(PENALTY_DECAY * now.tv_penalty, LAST_PENALTY * first.tv_penalty)
         sign_penalty = first.sign_penalty * penalty / first.tv_penalty
         self.parameters = replace(now, tv_weight=weight, tv_penalty=penalty, sign_penalty=sign_penalty)
         self._admm.reweigh(self.parameters)

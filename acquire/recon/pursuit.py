@@ -34,11 +34,11 @@ if TYPE_CHECKING:
     from acquire.recon.given import Given
 
 NO_COSINES = np.zeros(0, np.int64)
-ROUND, ROUNDS = 10, 6
+LOOK_ITERATIONS, LOOKS = 10, 6
 """Number of iterations between two looks at the residual, and the largest number of these."""
-COARSE_SIDE = 48
+RESIDUAL_SIDE = 48
 """Voxels along a side in which the residual is looked at: a lamp covers many, and noise averages out."""
-STANDS_OUT, AT_ONCE = 5.0, 6
+MAY_BE_A_LAMP, AT_ONCE = 5.0, 6
 """Ratio to the median of the cosines not solved for above which one may be a lamp's, and the largest number
 that one look adds."""
 BESIDE = 2
@@ -73,8 +73,8 @@ def pursue(
     lamps, dark = NO_COSINES, np.zeros(fastest, bool)
     sure, told = NO_COSINES, None
     look = _Look.at_start(given, _windows(lamps, fastest), still)
-    for made in range(ROUNDS):
-        for _ in iterations(look.estimate, ROUND):
+    for made in range(LOOKS):
+        for _ in iterations(look.estimate, LOOK_ITERATIONS):
             look.estimate.solver.step()
         light = look.light(lamps)
         dark[lamps[light < DARK]] = True
@@ -84,7 +84,7 @@ def pursue(
         sure = lamps[light >= max(LAMP, FAINT * light.max(initial=0))]
         if told is None and len(sure):
             told = _beyond(fastest_lamp(), sure.max(), fastest)
-        if made == ROUNDS - 1 or (len(sure) and look.is_clear):
+        if made == LOOKS - 1 or (len(sure) and look.is_clear):
             break
         energy = residual_energy(look.estimate.predict())
         usual = np.median(np.delete(energy, look.kept))
@@ -182,7 +182,7 @@ def _peaks(ratio: NDArray[np.float64]) -> NDArray[np.int64]:
     """The cosines that stand out most, at least a window apart."""
     found: list[int] = []
     left = ratio.copy()
-    while len(found) < AT_ONCE and left.max() > STANDS_OUT:
+    while len(found) < AT_ONCE and left.max() > MAY_BE_A_LAMP:
         highest = int(left.argmax())
         found.append(highest)
         left[max(0, highest - BESIDE) : highest + BESIDE + 1] = 0
@@ -193,7 +193,7 @@ def _spectrum(given: Given, count: int) -> Callable[[NDArray[np.float64]], NDArr
     """The energy of what a prediction leaves of the samples, per cosine."""
     segment, problem, temporal_merge = given.segment, given.problem, given.options.temporal_merge
     frames = given.video_shape[0]
-    merge = -(-segment.geometry.size // COARSE_SIDE)
+    merge = -(-segment.geometry.size // RESIDUAL_SIDE)
     operator = segment_operator(segment, TemporalBasis(frames, count), merge, temporal_merge)
 
     def energy(predicted: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -13,11 +13,11 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, Self
 
-from acquire.recon.blinking import EXPLAINED, first_look, refine
+from acquire.recon.blinking import AT_REST, first_look, refine
 from acquire.recon.candidates import LARGEST_WEIGHT, STILL, WEIGHT_STEP, Candidate, rounded
 from acquire.recon.cycle import FEWEST_CYCLES
 from acquire.recon.estimates import Preferred
-from acquire.recon.result import EXPLAINED as EXPLAINED_NOISE
+from acquire.recon.result import EXPLAINED
 from acquire.recon.workbench import FIRST_ITERATIONS, NEXT_ITERATIONS, SEARCH_SHARE
 
 if TYPE_CHECKING:
@@ -29,16 +29,16 @@ AS_CLOSELY = 1.05
 """Largest held-out error in units of the noise, relative to that where the choice was made, for which it
 fits: a search takes 2 % for a gain, and errors of a few hundred blocks differ by as much as this by
 chance."""
-COSINES = "cosines"
+COSINES_PRIOR = "cosines"
 
 
 @dataclass(frozen=True, slots=True)
 class Choice:
     """What was chosen, and how well it predicted: ``error`` and ``noise`` are relative to the samples.
 
-    ``prior`` is that of a candidate, or `COSINES`, of which only the number is handed over. ``brightness`` is
-    the number of cosines of the whole scene's brightness, 0 if that is constant, ``period_frames`` that of a
-    cycle, which the next part fits to its own lines.
+    ``prior`` is that of a candidate, or `COSINES_PRIOR`, of which only the number is handed over.
+    ``brightness`` is the number of cosines of the whole scene's brightness, 0 if that is constant,
+    ``period_frames`` that of a cycle, which the next part fits to its own lines.
     """
 
     prior: str
@@ -58,8 +58,10 @@ class Choice:
         # robust weights and a change's still are of this segment's lines
         if "candidates" not in found or found.get("robust") or found.get("change"):
             return None
-        counts = [each["temporal_coefficients"] for each in found["candidates"] if each["prior"] == COSINES]
-        in_cosines, cyclic = found["prior"] == COSINES, "harmonics" in found
+        counts = [
+            each["temporal_coefficients"] for each in found["candidates"] if each["prior"] == COSINES_PRIOR
+        ]
+        in_cosines, cyclic = found["prior"] == COSINES_PRIOR, "harmonics" in found
         return cls(
             prior=found["prior"],
             # of a cycle, the cosines up to its fastest harmonic are not what is solved for
@@ -79,7 +81,7 @@ class Choice:
         A choice that did not explain its own samples sets no looser standard than one that did.
         """
         if self.noise > 0 and noise > 0:
-            return error / noise <= AS_CLOSELY * min(self.error / self.noise, EXPLAINED_NOISE)
+            return error / noise <= AS_CLOSELY * min(self.error / self.noise, EXPLAINED)
         return error <= AS_CLOSELY * self.error
 
     def kept(self, parameters: dict[str, Any]) -> bool:
@@ -87,7 +89,10 @@ class Choice:
         same = parameters.get("prior") == self.prior
         if not same or bool(parameters.get("brightness")) != bool(self.brightness):
             return False
-        return self.prior == COSINES or (parameters["weight"], parameters["pace"]) == (self.weight, self.pace)
+        return self.prior == COSINES_PRIOR or (parameters["weight"], parameters["pace"]) == (
+            self.weight,
+            self.pace,
+        )
 
     def candidate(self, frames: int) -> Candidate:
         """The candidate to try on this many frames."""
@@ -113,7 +118,7 @@ def reuse_choice(bench: Workbench, trials: int) -> Estimate | None:
         return bench.finish(_strengthened(still))
     if at_rest:
         return bench.finish(still.bench.climb(still, trials)) if frames == 1 else None
-    if choice.prior == COSINES:
+    if choice.prior == COSINES_PRIOR:
         return _in_cosines(bench, still)
     if choice.period_frames * FEWEST_CYCLES > frames:
         return None
@@ -150,9 +155,9 @@ def _in_cosines(bench: Workbench, still: Trial) -> Estimate | None:
     band = replace(bench.given.options, bandwidth=min(1.0, choice.coefficients / bench.frames))
     given = replace(bench.given, options=band)
     # as in `choose`: from a start at zero the code would stay in the brightness
-    start = still.admm.theta if still.error < EXPLAINED else None
+    start = still.admm.theta if still.error < AT_REST else None
     cosines = first_look(given, start)
-    bench.record_errors({"prior": COSINES} | cosines.facts(), cosines.predict())
+    bench.record_errors({"prior": COSINES_PRIOR} | cosines.facts(), cosines.predict())
     found = refine(given, cosines)
     errors = bench.record_errors({"prior": "patterns"} | found.facts(), found.predict())
     ahead = bench.held_out.clearly_less(errors, still.errors)

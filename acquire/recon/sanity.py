@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
     Floats = NDArray[np.float64]
 
-SURE = 5.0
+SIGNIFICANT = 5.0
 """Standard errors beyond which a constant light is significant."""
 CONSTANT_SHARE, CONSTANT_ERROR = 0.03, 0.012
 """Smallest constant light, relative to an arm's mean, that is reported, since less costs little; and the
@@ -104,7 +104,7 @@ def _constant(name: str, lines: Floats, model: Model, mean: float) -> list[Suspi
         words = f"arm {name} is darker than its black level on average: the black level is too high"
         return [Suspicion("black_level", words)]
     value, error = model.constant(lines)
-    if error > CONSTANT_ERROR * mean or abs(value) < max(SURE * error, CONSTANT_SHARE * mean):
+    if error > CONSTANT_ERROR * mean or abs(value) < max(SIGNIFICANT * error, CONSTANT_SHARE * mean):
         return []
     share = f"{abs(value) / mean:.0%} ± {error / mean:.0%}"
     if value < 0:

@@ -22,17 +22,17 @@ if TYPE_CHECKING:
 DELAYS = (0, 3, -3, 6, -6, 10, -10)
 """Delays in sub-steps to start from, equal for both arms: pictures agree a little when they are this far
 off."""
-FARTHEST = 24
+FARTHEST_DELAY = 24
 RANDOM_CODES = 4
 """Number of random codes that show the agreement by chance."""
 LEAST_CONTRAST = 10.0
 VERIFIED_ALONE, VERIFIED, BEYOND = 4.0, 2.0, 3.0
 """Agreement of the arms at which a code is verified; the second is enough if the code also explains each
 arm's own lines better than random codes do, by the third in their standard deviations."""
-DOUBTFUL = 3.0
+FOREIGN = 3.0
 """Agreement below which a code is foreign; from here to verification, nothing is claimed."""
 OTHER_SUBSTEPS = (1, 2, 3, 4, 5, 6)
-USUAL = Prior(0.06, 0.3, 3.0, 1e-2)
+USUAL_PRIOR = Prior(0.06, 0.3, 3.0, 1e-2)
 """Prior for the comparison of other S, before the best of them gets a prior that suits it."""
 APART, APART_SHARE = 15.0, 0.15
 """Log likelihood, and share of the gain, by which delays that differ between the arms must exceed a common
@@ -111,7 +111,7 @@ def inquire(model: LineModel) -> Inquiry:
     if inquiry.standing is not Standing.UNEXPLAINED:
         return inquiry
     others = [Hypothesis(substeps=each) for each in OTHER_SUBSTEPS if each != model.substeps]
-    model.prior = USUAL
+    model.prior = USUAL_PRIOR
     substeps = max(others, key=lambda each: _contrast(model, each).contrast).substeps
     other = _inquire(model, substeps)
     # no other change is accepted with another S: with all delays to choose from, chance finds something
@@ -140,7 +140,7 @@ def _standing(described: Candidate, found: tuple[Candidate, ...]) -> Standing:
     best = found[0]
     if not best.verified:
         agreement = max(best.agreement, described.agreement)
-        foreign = agreement < DOUBTFUL and max(best.beyond, described.beyond) < VERIFIED_ALONE
+        foreign = agreement < FOREIGN and max(best.beyond, described.beyond) < VERIFIED_ALONE
         return Standing.UNEXPLAINED if foreign else Standing.UNCLEAR
     if best.hypothesis == described.hypothesis:
         return Standing.RIGHT
@@ -271,7 +271,7 @@ def _uphill(
     best, improved = start, True
     while improved:
         near = [(best[0] + sign * a, best[1] + sign * b) for a, b in steps for sign in (1, -1)]
-        near = [each for each in near if max(map(abs, each)) <= FARTHEST]
+        near = [each for each in near if max(map(abs, each)) <= FARTHEST_DELAY]
         better = max(near, key=gain, default=best)
         improved = gain(better) > gain(best)
         best = better if improved else best

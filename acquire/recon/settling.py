@@ -24,17 +24,17 @@ if TYPE_CHECKING:
     from acquire.recon.given import Given
     from acquire.recon.patterns import Refinement
 
-LEAST_GAIN = 0.003
+LEAST_PROGRESS = 0.003
 """Smallest relative gain of the held-out prediction for which a round counts as an improvement."""
-LEAST_GAIN_HELD = 5e-4
-"""`LEAST_GAIN` once λ is held: next to the noise, what is still gained is small."""
+LEAST_PROGRESS_HELD = 5e-4
+"""`LEAST_PROGRESS` once λ is held: next to the noise, what is still gained is small."""
 LOOSENED_IN_VAIN, PATIENCE = 3, 6
 """Number of rounds without improvement after which λ is no longer lowered, because noise is being fitted, and
 that end a refinement."""
 TIGHTER = 2.0
 """λ from then on, relative to that of the best round, which lagged behind the λ that it was given; and the
 step to the λ that is tried next."""
-SURE = 2.0
+BEYOND_CHANCE = 2.0
 """Standard errors of the held-out RMS by which a round must be worse to count as clearly so. By as much it
 rises and falls from round to round, and of λ that predict equally well the largest fits the least noise."""
 LONG = 60
@@ -43,7 +43,7 @@ has no time for that, nor to recover from patterns that fit noise."""
 FIRST_ROUND = 20.0
 """Time that the first round may take, relative to the longest iteration of the first look. It ends with a fit
 of the curves, which may take as long as ten to twenty of these; one that ends before gains nothing."""
-CLEARLY = 0.85
+BETTER_BESIDE_MOTION = 0.85
 """Largest error of patterns beside motion, relative to that of patterns alone, for which they are preferred:
 lamps beside a dot have 0.4, lamps alone 0.9 and more."""
 ONE_MORE = 0.9
@@ -69,7 +69,7 @@ def settle(given: Given, refinement: Refinement) -> Refinement:
     if course.refinement.loosens and course.refine_until_idle(clock, LOOSENED_IN_VAIN):
         course.hold(course.likely_weight)
     while course.refine_until_idle(clock, PATIENCE):
-        if course.recent >= (1 - LEAST_GAIN) * course.before:
+        if course.recent >= (1 - LEAST_PROGRESS) * course.before:
             clock.converged()
             break
         # by the used samples: the held-out ones rise and fall by more than λ changes them
@@ -92,7 +92,7 @@ class _Course:
         self._best, self._kept, self._idle = np.inf, (refinement, refinement.found), 0
         self._loosened = [(np.inf, refinement.parameters.tv_weight)]
         # an RMS of N values has a relative standard error of 1/√(2N)
-        self._doubt = SURE / np.sqrt(2 * max(1, given.problem.held_out.sum()))
+        self._doubt = BEYOND_CHANCE / np.sqrt(2 * max(1, given.problem.held_out.sum()))
 
     def refine_until_idle(self, clock: IterationClock, patience: int, most: int | None = None) -> bool:
         """Refine until this many rounds in turn gain nothing; False if it ends before, after ``most``."""
@@ -105,7 +105,7 @@ class _Course:
                 error = self._problem.prediction_error(predicted)
                 self.fits_noise = self._problem.misfit(predicted) < self._noise
                 # without held-out samples the error is NaN, which never counts as idle
-                least_gain = LEAST_GAIN if self.refinement.loosens else LEAST_GAIN_HELD
+                least_gain = LEAST_PROGRESS if self.refinement.loosens else LEAST_PROGRESS_HELD
                 self._idle = self._idle + 1 if error >= (1 - least_gain) * self.recent else 0
                 self.recent = min(self.recent, error)
                 # NaN, without held-out samples, makes the last round the best

@@ -18,7 +18,7 @@ from acquire.recon.kernels import SMALLEST_WEIGHT, joint_tv_prox, tv_prox, tv_va
 if TYPE_CHECKING:
     from acquire.arrays import Array
 
-LARGEST_WEIGHT = 1e6
+FLATTENING_WEIGHT = 1e6
 """Limit of the weights, at which every frame has long been flat and 1/λ is still representable."""
 
 
@@ -52,7 +52,9 @@ class FrameTv:
         """
         xp = namespace(frames)
         capped = (
-            min(weight, LARGEST_WEIGHT) if isinstance(weight, float) else xp.minimum(weight, LARGEST_WEIGHT)
+            min(weight, FLATTENING_WEIGHT)
+            if isinstance(weight, float)
+            else xp.minimum(weight, FLATTENING_WEIGHT)
         )
         # (K,) in the frames' dtype, whether one number was given or K
         weights = xp.zeros_like(frames[:, 0, 0]) + capped

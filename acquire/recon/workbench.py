@@ -39,7 +39,7 @@ LAST_ITERATIONS = 15
 """Number of final iterations of the best candidate, with all samples."""
 SEARCH_SHARE = 0.6
 """Upper limit on the search's share of the budget."""
-LEAST_GAIN = 0.02
+GAIN_OF_WEAKER = 0.02
 """Relative gain of the prediction that a weaker prior needs to be preferred; a stronger one needs none."""
 BRIGHT_ROUNDS = 8
 """Largest number of fits of the whole scene's brightness, in turn with a volume."""
@@ -64,7 +64,7 @@ PARTS = (3, 2)
 PROBE, HOPELESS = 10, 2.5
 """Number of iterations after which a trial ends whose error is this many times that of a rival: the cosines'
 lead is 4 and more for lamps, and 1.3 to 2 for a flame or a scene that flickers as a whole."""
-STEADY = 0.03
+STEADY_BRIGHTNESS = 0.03
 """Standard deviation of a brightness that is left to the other priors."""
 
 
@@ -164,12 +164,14 @@ class Workbench:
         self._fit_brightness(
             np.broadcast_to(picture, (self.frames, *picture.shape)), None, self._bright_cosines
         )
-        if self._brightness is None or self._brightness.std() < STEADY:  # its mean is 1
+        if self._brightness is None or self._brightness.std() < STEADY_BRIGHTNESS:  # its mean is 1
             return None
         best = self.probe(replace(self.fitting(CALM), brightness=True), rival)
         return self.follow_brightness(best, rival, WIDER) if best.error < HOPELESS * rival else best
 
-    def follow_brightness(self, best: Trial, rival: float = np.inf, wider: float = 1 - LEAST_GAIN) -> Trial:
+    def follow_brightness(
+        self, best: Trial, rival: float = np.inf, wider: float = 1 - GAIN_OF_WEAKER
+    ) -> Trial:
         """Fit the brightness and a volume in turn as long as this improves the prediction.
 
         When it no longer does, the brightness gets twice as many cosines: the error has to fall to ``wider``
@@ -182,7 +184,7 @@ class Workbench:
             self._fit_brightness(np.maximum(self.video(best), 0), best.brightness, cosines)
             found = self.attempt(best.candidate, NEXT_ITERATIONS, best)
             widened = cosines > self._bright_cosines
-            usual = 1 - LEAST_GAIN if found.error < rival else PURSUED
+            usual = 1 - GAIN_OF_WEAKER if found.error < rival else PURSUED
             improved = found.error < (wider if widened else usual) * best.error
             if improved or (not widened and found.error < best.error):
                 best, self._bright_cosines = found, cosines
@@ -359,7 +361,7 @@ class Workbench:
                         return best
                     tried.add(candidate)
                     found = self.attempt(candidate, NEXT_ITERATIONS, best)
-                    gain = 0.0 if candidate.is_stronger_than(best.candidate) else LEAST_GAIN
+                    gain = 0.0 if candidate.is_stronger_than(best.candidate) else GAIN_OF_WEAKER
                     if not found.error < (1 - gain) * best.error:
                         break
                     best, improved = found, True

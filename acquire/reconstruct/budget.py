@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 
 from acquire.cores import slowness
 from acquire.errors import UsageError
-from acquire.recon.feasibility import MARGIN, MARGIN_S, least_seconds
+from acquire.recon.feasibility import OVERRUN_S, OVERRUN_SHARE, least_seconds
 from acquire.reconstruct.work import LEAST_BUDGET_S
 
 if TYPE_CHECKING:
@@ -68,7 +68,7 @@ class Budget:
                 known[kind] = least_seconds(few, *kind[:2], task.options.solver)
             least_s += known.get(kind, max(known.values())) + self._writing_s_per_voxel * _voxels(task)
         needed_s = self.seconds - self.left_s + least_s / self._workers
-        if needed_s > (1 + MARGIN) * self.seconds + MARGIN_S:
+        if needed_s > (1 + OVERRUN_SHARE) * self.seconds + OVERRUN_S:
             what = "this segment needs" if len(tasks) == 1 else f"these {len(tasks)} sub-segments need"
             raise UsageError(
                 f"a budget of {self.seconds:g} s cannot be kept: {what} at least {needed_s:.2g} s here",

@@ -38,7 +38,7 @@ if TYPE_CHECKING:
     from acquire.reconstruct.work import Options, Part
     from acquire.store import Recording
 
-LOOK_S = 0.1
+POLL_S = 0.1
 """Interval at which the waiting thread checks the progress and Ctrl-C."""
 QUALITY_KEYS = ("misfit", "prediction", "coverage", "noise")
 
@@ -168,12 +168,12 @@ def _result(waiting: deque[Future[Part]], pool: Pool, watcher: Watcher) -> Part 
     """Wait for the first future and return its part; None if it was cancelled."""
     future = waiting.popleft()
     try:
-        while not wait([future], LOOK_S).done:
+        while not wait([future], POLL_S).done:
             if watcher(pool.share_done()):
                 pool.stop()
                 for each in (future, *waiting):
                     each.cancel()
-        # tasks that end sooner than `LOOK_S` are reported, too
+        # tasks that end sooner than `POLL_S` are reported, too
         watcher(pool.share_done())
         return future.result()
     except CancelledError:

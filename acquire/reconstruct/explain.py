@@ -26,8 +26,8 @@ if TYPE_CHECKING:
     from acquire.calibrate import Calibration
     from acquire.lines import Segment
 
-ITERATIONS = 80
-MOST_LINES = 264
+TRIAL_ITERATIONS = 80
+TRIAL_LINES = 264
 OFFSETS, CURVE = ("offset_dn", "ambient_dn"), ("excess_dn",)
 LIGHT = ("shading",)
 GAINS = ("gain", *LIGHT)
@@ -94,11 +94,11 @@ class _Trial:
 def _trial(segment: Segment, merges: tuple[int, int], bandwidth: float | None) -> _Trial:
     # no check and no estimate of the error, which would count as time of the iterations
     result = reconstruct(
-        segment, *merges, iterations=ITERATIONS, bandwidth=bandwidth, check=False, error=False
+        segment, *merges, iterations=TRIAL_ITERATIONS, bandwidth=bandwidth, check=False, error=False
     )
     coefficients = int(result.parameters.get("temporal_coefficients", 1))
     # trials end after different numbers of iterations, so that the time of as many is compared
-    seconds = result.seconds / max(result.iterations, 1) * ITERATIONS
+    seconds = result.seconds / max(result.iterations, 1) * TRIAL_ITERATIONS
     return _Trial(result.quality.prediction, seconds, coefficients)
 
 

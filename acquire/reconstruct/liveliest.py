@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from acquire.lines import Segment
     from acquire.store import Recording
 
-MOST_LINES = 4
+MOST_PASSES = 4
 """Upper limit on the lines of a tile that are examined, in n."""
 SPARE_LINES = 1.25
 """Least ratio of lines to unknowns of a scene at rest; below it the fit absorbs too much of the changes."""
@@ -67,7 +67,7 @@ def liveliest(
     ``read`` prepares the lines. Without ``moving``, or if nothing changes, it is the tile with most contrast.
     """
     (first, count), size = stretch, recording.geometry_for(1).size
-    most = min(count, MOST_LINES * size)
+    most = min(count, MOST_PASSES * size)
     # the middle, and no more than 4·n lines: the fit's design grows with lines × n
     begin = first + (count - most) // 2
     by_tile = [energies(read(recording.cut(begin, most, tile))) for tile in tiles]

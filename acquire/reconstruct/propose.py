@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 LOOKED_AT = 4
 """Length of a range that is judged separately, in n; changes are located no more precisely than that."""
-LONGEST = 12
+LONGEST_SEGMENT = 12
 """Upper limit on the length of a sub-segment, in n."""
 VOXELS_OF_A_TILE = 64
 """Voxels along a side of a tile, as in the paper's smallest scene. Without intra-line steps, voxels of S = 1
@@ -70,7 +70,7 @@ def propose(
     found = list(zip(stretches, _tempos(len(stretches), look, progress), strict=True))
     groups = [list(group) for _, group in groupby(found, key=lambda each: each[1].voxels)]
     # ranges of a group that one sub-segment may hold
-    most = LONGEST // LOOKED_AT
+    most = LONGEST_SEGMENT // LOOKED_AT
     parts = [_part(group[i : i + most]) for group in groups for i in range(0, len(group), most)]
     if tile is not None:
         parts = [part.model_copy(update={"why": f"tile {tile}: {part.why}"}) for part in parts]

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from acquire.recon.settling import LOOSENED_IN_VAIN, SURE, TIGHTER, _Course
+from acquire.recon.settling import BEYOND_CHANCE, LOOSENED_IN_VAIN, TIGHTER, _Course
 
 HELD_OUT = 800
 NOISE = 1.0
@@ -75,9 +75,9 @@ def test_three_rounds_in_vain_end_it_where_noise_is_not_fitted_or_unknown(noise:
 
 
 def test_the_largest_weight_that_predicts_as_well_is_held() -> None:
-    within = 1 + 0.9 * SURE / (2 * HELD_OUT) ** 0.5
+    within = 1 + 0.9 * BEYOND_CHANCE / (2 * HELD_OUT) ** 0.5
     found = course((8e-4, 2.0, 1.4), (4e-4, within, 1.2), (2e-4, 1.2, 1.1), (1e-4, 1.0, 1.05))
     assert found.likely_weight == 4e-4
-    beyond = 1 + 1.1 * SURE / (2 * HELD_OUT) ** 0.5
+    beyond = 1 + 1.1 * BEYOND_CHANCE / (2 * HELD_OUT) ** 0.5
     found = course((8e-4, 2.0, 1.4), (4e-4, beyond, 1.2), (2e-4, 1.2, 1.1), (1e-4, 1.0, 1.05))
     assert found.likely_weight == TIGHTER * 1e-4
