@@ -4,7 +4,7 @@ With V known, a line is linear in g: Y(i, ·) = Σ_t g(t)·E(t)·V's light along
 There are a few hundred unknowns for all samples; if V contains part of the brightness already, g stays near
 1. The lines carry no information about sub-steps without light: with more cosines than g needs, least squares
 would let it run wild between two flashes. Each cosine of g − 1 therefore has an energy γ that it shares with
-its neighbours; γ and the noise σ² are those for which the lines are most likely, as in `curves`.
+its neighbours; γ and the noise σ² are those for which the lines are most likely (`evidence`).
 """
 
 from __future__ import annotations
@@ -14,8 +14,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from scipy.ndimage import uniform_filter1d
 
-from acquire.forward import blurring, column_merging, registration
+from acquire.forward import column_merging
 from acquire.recon.basis import TemporalBasis
+from acquire.recon.evidence import FAINTEST, NormalEquations, determined_share
+from acquire.recon.views import seen_by_arms
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -28,11 +30,6 @@ START_RIDGE = 1e-3
 MOST_STEPS = 12
 NEIGHBOURS = 9
 """Number of neighbouring cosines that share their energy: the light of one lamp is rarely in a single one."""
-FAINTEST = 1e-10
-"""Smallest energy, noise and precision relative to the largest energy, the lines' and the mean eigenvalue:
-smaller ones would never come back, or leave the equations singular."""
-LEAST_DETERMINED = 0.01
-"""Smallest share of an unknown that counts as determined by the lines; it bounds a step of its energy."""
 DIMMEST = 0.02
 """Smallest brightness relative to the mean; dimmer instants would not be seen at all."""
 
@@ -79,39 +76,29 @@ def fit_brightness(
         return np.ones(frames)  # a dark video explains nothing, however bright
     # g = 1, to which the prior draws: solved for is g − 1
     flat = basis @ np.ones(frames)
-    left = energy - 2 * float(flat @ right) + float(flat @ normal @ flat)
-    change = _most_likely(normal, right - normal @ flat, left, samples)
+    left = NormalEquations(normal, right, energy, samples).left(flat)
+    change = _most_likely(NormalEquations(normal, right - normal @ flat, left, samples))
     brightness = np.maximum(basis.T @ (flat + change), DIMMEST)
     return np.asarray(brightness / brightness.mean())
 
 
 def _views(segment: Segment, video: NDArray[Any], spatial_merge: int) -> tuple[NDArray[Any], NDArray[Any]]:
     """Return the video as each arm's sensor has it (time, block along the charge, block across)."""
-    alignment, blur, geometry = segment.alignment, segment.blur, segment.geometry
     # a picture that does not change is one frame, repeated without being copied
     frames = video[:1] if video.strides[0] == 0 else video
-    view_a = view_b = np.ascontiguousarray(frames, np.float32)
-    if (moved := registration(alignment, geometry, spatial_merge)) is not None:
-        view_b = moved.forward(view_b)
-    if (blurred := blurring(blur, geometry, spatial_merge)) is not None:
-        view_a, view_b = blurred.forward(0, view_a), blurred.forward(1, view_b)
-    a, b = (np.broadcast_to(view, video.shape) for view in (view_a, view_b))
+    views = seen_by_arms(segment, np.ascontiguousarray(frames, np.float32), spatial_merge)
+    a, b = (np.broadcast_to(view, video.shape) for view in views)
     return a, b.transpose(0, 2, 1)
 
 
-def _most_likely(
-    normal: NDArray[np.float64], right: NDArray[np.float64], energy: float, samples: int
-) -> NDArray[np.float64]:
-    """The solution x (K,) of normal·x = right with the prior for which the lines are most likely.
-
-    ``energy`` is the sum of the squares of the ``samples``. The lines determine a share of each unknown; its
-    energy is its square over that share (MacKay, Neural Comput. 4, 415 (1992)).
-    """
+def _most_likely(equations: NormalEquations) -> NDArray[np.float64]:
+    """Solve for x (K,) with the prior for which the lines are most likely (`evidence`)."""
+    normal, right = equations.normal, equations.right
     diagonal = np.diag_indices_from(normal)
     damped, mean_eigenvalue = normal.copy(), np.trace(normal) / len(normal)
     damped[diagonal] += START_RIDGE * mean_eigenvalue
     x: NDArray[np.float64] = np.asarray(np.linalg.solve(damped, right), np.float64)
-    share, noise = np.full(len(x), np.square(x).mean()), energy / samples
+    share, noise = np.full(len(x), np.square(x).mean()), equations.energy / equations.samples
     for _ in range(MOST_STEPS):
         if share.max() < FAINTEST**2 or not noise > 0:
             break  # g is 1, or explains the lines exactly
@@ -121,8 +108,7 @@ def _most_likely(
         damped[diagonal] += precision
         inverse = np.linalg.inv(damped)
         x = np.asarray(inverse @ right, np.float64)
-        determined = np.clip(1 - precision * np.diag(inverse), LEAST_DETERMINED, 1)
+        determined = determined_share(precision, inverse)
         share = uniform_filter1d(np.square(x) / determined, NEIGHBOURS, mode="nearest")
-        left = energy - 2 * float(x @ right) + float(x @ normal @ x)
-        noise = max(left, FAINTEST * energy) / max(samples - float(determined.sum()), 1.0)
+        noise = equations.noise(x, determined)
     return x

@@ -13,7 +13,7 @@ and with its inverse as preconditioner a few steps are enough if some samples ar
 Without a prior, noise and the errors of the patterns go into the cosines that the lines hardly determine: the
 curves of fast lamps lose their amplitude. γ_c, the energy of cosine c, is shared by the patterns, so that it
 means the same however they are rotated; it and the noise σ² are those for which the lines are most likely
-(the evidence, MacKay, Neural Comput. 4, 415 (1992)). On lines without noise the prior fades out.
+(`evidence`). On lines without noise the prior fades out.
 """
 
 from __future__ import annotations
@@ -24,7 +24,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from acquire.arrays import dot, host
-from acquire.forward import blurring, column_merging, registration
+from acquire.forward import column_merging
+from acquire.recon.evidence import FAINTEST, NormalEquations, determined_share
+from acquire.recon.views import seen_by_arms
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -44,10 +46,6 @@ REFRESH = 4
 """Number of calls that share a preconditioner and a prior."""
 EVIDENCE_STEPS = 2
 """Number of fixed-point steps of the prior in such a call; it converges over the calls."""
-FAINTEST = 1e-10
-"""Smallest energy of a cosine relative to the largest: below it, the cosine would never come back."""
-LEAST_DETERMINED = 0.01
-"""Smallest share of an unknown that counts as determined by the lines; it bounds a step of its energy."""
 LARGEST_SPAN = 8192
 """Largest number of sub-steps for which the normal matrix is formed; it would take too much memory beyond."""
 LARGEST_UNKNOWNS = 4096
@@ -131,12 +129,11 @@ class CurveFit:
         """Update damping, preconditioner and, if the fit learns, its prior.
 
         ``gram`` is the normal matrix of all samples before their scaling, ``gradient`` (K, R) the adjoint of
-        the residual of ``start``, ``energy`` the sum of its squares. The lines determine a share of each
-        unknown, 1 − σ²/γ·(G + σ²/γ)⁻¹ on the diagonal: a cosine's energy is its mean square over that share,
-        and the noise is the residual's over the samples that no unknown takes up.
+        the residual of ``start``, ``energy`` the sum of its squares. A cosine's energy is the mean over the
+        patterns of its squares, each over the share of it that the lines determine.
         """
         cosines, rank = start.shape
-        samples = np.count_nonzero(self._problem.weight)
+        samples = int(np.count_nonzero(self._problem.weight))
         # as if the masked samples were spread evenly, which is near enough for a preconditioner and a prior
         gram *= samples / self._problem.weight.size / self._problem.norm**2
         self._damping = max(self._ridge * float(np.trace(gram)) / len(gram), float(np.finfo(np.float32).tiny))
@@ -148,7 +145,7 @@ class CurveFit:
             # of cosines that were not solved for nothing is known, and without light they would stay dark
             likely[likely == 0] = np.median(likely[likely > 0])
             self.prior = CurvePrior(likely, energy / samples)
-        diagonal = np.diag_indices_from(gram)
+        equations, diagonal = NormalEquations(gram, slope, energy, samples), np.diag_indices_from(gram)
         for _ in range(EVIDENCE_STEPS if self._learns else 1):
             added = np.zeros(len(gram)) if self.prior is None else np.tile(self.prior.precision[:, 0], rank)
             matrix = gram.copy()
@@ -157,13 +154,11 @@ class CurveFit:
             if not self._learns:
                 break
             change = inverse @ (slope - added * before)
-            determined = np.clip(1 - added * np.diag(inverse), LEAST_DETERMINED, 1)
-            left = energy - 2 * float(change @ slope) + float(change @ gram @ change)
+            determined = determined_share(added, inverse)
             energies = (np.square(before + change) / determined).reshape(rank, cosines).mean(0)
             if not energies.max() > np.finfo(np.float32).tiny:
                 break  # the curves are 0, of which no prior can be learnt
-            noise = max(left, FAINTEST * energy) / max(samples - determined.sum(), 1.0)
-            self.prior = CurvePrior(energies, noise)
+            self.prior = CurvePrior(energies, equations.noise(change, determined))
         exact = self._problem.arrays.exact()
         solver = exact.asarray(inverse)
 
@@ -189,13 +184,9 @@ class CurveOperator:
         self._frame = self._arrays.indices(substeps // temporal_merge)
         self._windows = self._arrays.indices(windows.ravel())
         self._code = self._arrays.asarray(segment.code)
-        aligned = registration(segment.alignment, segment.geometry, 1, self._arrays)
-        view_b = patterns if aligned is None else aligned.forward(patterns)
-        blurred = blurring(segment.blur, segment.geometry, 1, self._arrays)
-        if blurred is not None:
-            patterns, view_b = blurred.forward(0, patterns), blurred.forward(1, view_b)
+        view_a, view_b = seen_by_arms(segment, patterns, 1, self._arrays)
         # arm B's rows are the scene's columns from right to left
-        views = (patterns, self._xp.flip(self._xp.permute_dims(view_b, (0, 2, 1)), axis=1))
+        views = (view_a, self._xp.flip(self._xp.permute_dims(view_b, (0, 2, 1)), axis=1))
         merging = self._arrays.asarray(column_merging(segment.geometry, 1))
         self._profiles = [_profiles(self._xp, view, merging, segment.geometry.substeps) for view in views]
         self._matrix = self._arrays.asarray(cosines.matrix())
