@@ -72,16 +72,16 @@ def unresolved_hz(
     if span > LONGEST_SEARCHED or not given.clock.affords(SEARCH_S * (span / SEARCHED_SPAN) ** 3):
         return None
     rate_hz = 1e9 / segment.substep_ns
-    # cosine k of the sub-steps is light of k·rate/(2·span)
+    # Cosine k of the sub-steps is light of k·rate/(2·span).
     first = int(np.ceil(CLEAR_OF_BAND * resolved_hz * 2 * span / rate_hz))
     count = int(SHARE * span)
     residual = np.where(problem.usable, problem.samples - predicted, 0)
     patterns = _patterns(video, segment.geometry.size)
-    # without a window of cosines beyond the band there is nothing that light could stand out of
+    # Without a window of cosines beyond the band there is nothing that light could stand out of.
     if first + RIVALS > count or not patterns or not residual.any():
         return None
     basis = TemporalBasis(span, count)
-    # a lamp may be in several patterns, each with a curve of its own: the energies add up
+    # A lamp may be in several patterns, each with a curve of its own: the energies add up.
     energy = sum((_energy(segment, each, residual, basis) for each in patterns), np.zeros(count))
     usual = np.maximum(
         percentile_filter(energy, OFTEN, RIVALS, mode="nearest"), np.percentile(energy[first:], OFTEN)
@@ -110,17 +110,17 @@ def _patterns(video: NDArray[Any], size: int) -> list[NDArray[np.float32]]:
     curves = np.linalg.svd(coarse.reshape(frames, -1).astype(np.float64), full_matrices=False)[0][
         :, :PATTERNS
     ]
-    # coarse voxels are enough to find the curves; the patterns keep the voxels of the video
+    # Coarse voxels are enough to find the curves; the patterns keep the voxels of the video.
     strongest = list(np.tensordot(curves.T.astype(video.dtype), video, axes=1))
     mean, strips = video.mean(0), []
     for rows in np.array_split(np.arange(side), STRIPS):
         strip = np.zeros_like(mean)
         strip[rows] = mean[rows]
         across = np.zeros_like(mean)
-        # frames are square: the indices of rows are those of columns, too
+        # Frames are square: the indices of rows are those of columns, too.
         across[:, rows] = mean[:, rows]
         strips += [strip, across]
-    # `CurveOperator` takes fine pixels; a voxel is held over its block
+    # `CurveOperator` takes fine pixels; a voxel is held over its block.
     merge = -(-size // side)
     held = [each.repeat(merge, axis=0).repeat(merge, axis=1)[:size, :size] for each in strongest + strips]
     found = [each.astype(np.float32) for each in held]
@@ -136,7 +136,7 @@ def _energy(
     gram = np.asarray(operator.gram(), np.float64)
     right = np.asarray(operator.adjoint(residual.astype(np.float32)), np.float64)[:, 0]
     inverse = np.linalg.inv(gram + DAMPING * np.trace(gram) / len(gram) * np.eye(len(gram)))
-    # of the damped fit to white noise: the diagonal of (G + δ)⁻¹·G·(G + δ)⁻¹·σ²
+    # The variance of the damped fit to white noise is the diagonal of (G + δ)⁻¹·G·(G + δ)⁻¹·σ².
     variance = np.einsum("ij,ji->i", inverse @ gram, inverse) * np.square(residual, dtype=np.float64).mean()
     ratio: NDArray[np.float64] = np.square(inverse @ right) / np.maximum(variance, np.finfo(np.float64).tiny)
     return ratio

@@ -107,7 +107,7 @@ def reconstruct(
         usable sample
     NumericsError : a dark code, or iterates that are not finite
     """
-    # a budget covers the whole call
+    # A budget covers the whole call.
     began = time.monotonic()
     if not isinstance(segment, Segment):
         raise UsageError(
@@ -139,18 +139,18 @@ def reconstruct(
     clock = IterationClock(count, budget_s, progress, stop, began)
     segment, balance_warnings, balance_facts = _balanced(segment)
     held_out = HOLD_OUT if chosen.holds_out and static_image is None else 0.0
-    # BLAS's threads busy-wait for a core that others use; the arms are computed side by side instead
+    # BLAS's threads busy-wait for a core that others use; the arms are computed side by side instead.
     threads = 1 if granted_threads() == 1 else idle_cores()
     with limit_threads(threads), limit_blas(1):
-        # the probe times the compiled loops, which tell nothing about other arrays
+        # The probe times the compiled loops, which tell nothing about other arrays.
         if budget_s is not None and refuse and arrays.compiled:
             least_s = least_seconds(segment.geometry, spatial_merge, temporal_merge, solver)
             check_budget(clock, budget_s, least_s)
-        # after the check, because posing the problem (the operator's norm) takes time itself
+        # It comes after the check, because posing the problem (the operator's norm) takes time itself.
         problem = build_problem(segment, spatial_merge, temporal_merge, hold_out=held_out, arrays=arrays)
         given = Given(segment, problem, options, clock)
         run = _Run(given, chosen)
-        # before the solver runs, which would otherwise use the whole budget
+        # The time is reserved before the solver runs, which would otherwise use the whole budget.
         if error and chosen.goes_on and static_image is None:
             clock.reserve(RESERVED_ITERATIONS)
         if look is not None:
@@ -203,12 +203,12 @@ class _Run:
         prediction = problem.prediction_error(predicted) if held_out is None else held_out
         quality = Quality(problem.misfit(predicted), prediction, problem.coverage, self.given.noise)
         trusted = segment.geometry.trusted_frames(T_m)
-        # whoever stops a run wants the answer now
+        # Whoever stops a run wants the answer now.
         check = check and options.static_image is None and clock.ended != "stopped"
         checked = check_description(segment, quality, clock) if check else DescriptionCheck()
         facts = estimate.facts()
         one_hz = cosine_hz(segment.substep_ns * T_m, len(video))
-        # solvers without a band are free in every frame
+        # Solvers without a band are free in every frame.
         whole = [(0, facts.get("temporal_coefficients", len(video)))]
         bands_hz = [(a * one_hz, b * one_hz) for a, b in facts.pop("bands", whole)]
         resolved_hz = bands_hz[-1][1]
@@ -216,7 +216,7 @@ class _Run:
         if check and checked.believed:
             unresolved = detect_unresolved_light(self.given, predicted, video, resolved_hz)
         video_error: VideoError | str = "it was not requested"
-        # the lines that an error would be estimated from show neither of the first two
+        # The lines that an error would be estimated from show neither of the first two.
         if error and not checked.believed:
             video_error = "the lines contradict their description"
         elif error and unresolved:

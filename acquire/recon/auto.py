@@ -59,7 +59,7 @@ def tempo(
             progress(len(tried) / most)
 
     geometry = segment.geometry
-    # S fine pixels are one pixel of the camera
+    # S fine pixels are one pixel of the camera.
     side = min(side or geometry.substeps, geometry.size)
     still = _error(segment, Voxels(1, geometry.span))
     tried = [(0, still)]
@@ -73,15 +73,15 @@ def tempo(
         done()
         if error * BETTER <= best:
             best, chosen = error, Voxels(side, merge)
-        # light that is faster than the long frames makes those no better than a still: until one beats the
-        # still, shorter ones may
+        # Light that is faster than the long frames makes those no better than a still: until one beats the
+        # still, shorter ones may.
         elif chosen.temporal_merge < geometry.span:
             break
     return Tempo(chosen, tuple(tried))
 
 
 def _error(segment: Segment, voxels: Voxels) -> float:
-    # only the prediction counts: an estimate of the video's error would take up to 30 more iterations
+    # Only the prediction counts: an estimate of the video's error would take up to 30 more iterations.
     quality = reconstruct(
         segment,
         voxels.spatial_merge,
@@ -91,5 +91,5 @@ def _error(segment: Segment, voxels: Voxels) -> float:
         check=False,
         error=False,
     ).quality
-    # very few lines have no held-out samples
+    # Very few lines have no held-out samples.
     return quality.misfit if np.isnan(quality.prediction) else quality.prediction

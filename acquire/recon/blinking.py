@@ -51,7 +51,8 @@ GLANCE, FIRST_LOOK, LONGER_LOOK = 20, 60, 90
 """Number of iterations in the cosines before they are compared with other priors (and before it is decided
 whether few frames explain the lines), and before patterns are looked for; the last if patterns are in
 doubt."""
-# a longer look at 146 cosines (Fig. 9, one code) left 10 s no time to drop four superfluous patterns: 7 dB
+# A longer look at 146 cosines (Fig. 9, one code) left 10 s no time to drop four superfluous patterns, which
+# cost 7 dB.
 FIRST_LOOK_SHARE, LONGER_SHARE = 0.7, 0.4
 """Upper limit on the first look's share of the budget, and the share after which it is not made longer."""
 BEYOND_S = 2e-6
@@ -148,13 +149,13 @@ def _followed(
     if alone:
         look = widened(given, first, cosine)
     else:
-        # the constant cosine is a still, of which the wider band is to find the change
+        # The constant cosine is a still, of which the wider band is to find the change.
         still, count = first.solver.theta[:1, ...], round(MARGIN * (cosine + 1))
         look = _solve_glance(given, count, still)
     complete_look(given, look)
     wider = _refine_once(given, look)
     before, after = (given.problem.prediction_error(each.predict()) for each in (found, wider))
-    # the noise that many cosines admit hardly shows in the lines, and patterns admit little of it
+    # The noise that many cosines admit hardly shows in the lines, and patterns admit little of it.
     if after < (1 if isinstance(wider, Refined) else FREER) * before:
         return look, wider
     if after < before:
@@ -176,7 +177,7 @@ def _hidden_lamp(given: Given, first: InBand, found: Estimate) -> int | None:
     if found_hz is None:
         return None
     cosine = round(found_hz / cosine_hz(frame_ns, first.basis.frames))
-    # frames may be too slow for it
+    # Frames may be too slow for it.
     most = reachable(first.basis.frames, temporal_merge, FASTEST_SHARE)
     return cosine if cosine < most else None
 
@@ -202,14 +203,14 @@ def _solve_glance(given: Given, count: int, still: Array | None) -> InBand:
     basis = TemporalBasis(frames, min(frames, count), problem.arrays)
     start = None if still is None else resized(still, basis)
     if given.options.initial is not None:
-        # in the solvers' units, as `_Run.in_scene_units` undoes at the end
+        # The start is in the solvers' units, as `_Run.in_scene_units` undoes at the end.
         start = basis.analyze(problem.arrays.asarray(given.options.initial / problem.scale))
     estimate = begin_in_cosines(given, basis, start)
     for _ in given.clock.run(_at_most(GLANCE, given), "first look", FIRST_LOOK_SHARE, estimate.video):
         estimate.solver.step()
     few = 1 < frames <= FEW_FRAMES
     if few and problem.prediction_error(estimate.predict()) < AT_REST:
-        # freed of the high penalties, few frames at rest reached 36 dB instead of 21
+        # Freed of the high penalties, few frames at rest reached 36 dB instead of 21.
         estimate = begin_in_cosines(given, basis, estimate.solver.theta, explained=True)
     return estimate
 
@@ -236,7 +237,7 @@ def _in_patterns(given: Given, first: InBand) -> Estimate | None:
     If it is in doubt whether it does, or if they predict worse than the look, something may move beside them.
     """
     segment, problem, clock = given.segment, given.problem, given.clock
-    # curves are fitted at the end of a round: less than one gains nothing
+    # Curves are fitted at the end of a round: less than a round gains nothing.
     if clock.done >= clock.iterations or not clock.affords(ROUND * clock.longest_s):
         return None
     theta = host(first.solver.theta)
@@ -250,7 +251,7 @@ def _in_patterns(given: Given, first: InBand) -> Estimate | None:
     alone = find_patterns(theta)
     usual = None if alone is None else partial(begin, Refinement, alone)
     rivals: list[Callable[[], Refinement]] = []
-    # each refinement of a large segment holds a video's worth of memory
+    # Each refinement of a large segment holds a video's worth of memory.
     if not is_large(segment.geometry, given.options.spatial_merge):
         rivals = [partial(begin, beside_motion, each) for each in find_lamps(theta, first.basis)]
     error, noise = problem.prediction_error(first.predict()), given.noise
@@ -270,7 +271,7 @@ def _in_patterns(given: Given, first: InBand) -> Estimate | None:
             if other is not None:
                 other = settle(given, other)
                 refinement = other if problem.prediction_error(other.predict()) < left else refinement
-    # without held-out samples both are NaN
+    # Without held-out samples both are NaN.
     if refinement is None or error < problem.prediction_error(refinement.predict()):
         return None
     return Refined(refinement, basis.count)
@@ -296,8 +297,8 @@ def _for_noise(given: Given, first: InBand) -> AdmmParameters:
     Without held-out samples and known noise the NaN leaves the weight as it is.
     """
     noise = given.noise
-    # infinite for lines without light, NaN if it is unknown
+    # The noise is infinite for lines without light, and NaN if it is unknown.
     if not noise < np.inf:
         noise = NOISE_SHARE * given.problem.prediction_error(first.predict())
-    # the constant first: `max` returns it if the other is NaN
+    # The constant comes first: `max` returns it if the other is NaN.
     return replace(PARAMETERS, tv_weight=max(PARAMETERS.tv_weight, WEIGHT_PER_NOISE * noise))

@@ -54,7 +54,7 @@ def fit_brightness(
     lit = (basis[:, frame] * segment.code).T.astype(np.float32)
     merging = column_merging(geometry, spatial_merge).astype(np.float32)
     normal, right, energy, samples = np.zeros((cosines, cosines)), np.zeros(cosines), 0.0, 0
-    # arm B's rows are the scene's columns from right to left
+    # Arm B's rows are the scene's columns from right to left.
     blocks = (np.arange(n) // spatial_merge, np.arange(n)[::-1] // spatial_merge)
     for arm, (view, row) in enumerate(zip(_views(segment, video, spatial_merge), blocks, strict=True)):
         pixels = view @ merging
@@ -62,19 +62,19 @@ def fit_brightness(
             used = problem.weight[arm, line] > 0
             seen = np.zeros((len(used), cosines), np.float32)
             for u in range(S):
-                # step u of a line exposes row r in sub-step line·S + u + r
+                # Step u of a line exposes row r in sub-step line·S + u + r.
                 instants = line * S + u + np.arange(n)
                 seen += pixels[frame[instants], row].T @ lit[instants]
-            # summed over all lines in float64, since the normal matrix is inverted
+            # The sums over all lines are in float64, since the normal matrix is inverted.
             rows = seen[used].astype(np.float64)
             normal += rows.T @ rows
-            # pixels are Λ′ itself applied to the video, without the norm that samples are divided by
+            # Pixels are Λ′ itself applied to the video, without the norm that samples are divided by.
             lines = problem.samples[arm, line][used].astype(np.float64) * problem.norm
             right += rows.T @ lines
             energy, samples = energy + float(lines @ lines), samples + len(lines)
     if not normal.any():
         return np.ones(frames)  # a dark video explains nothing, however bright
-    # g = 1, to which the prior draws: solved for is g − 1
+    # The prior draws to g = 1, so that g − 1 is solved for.
     flat = basis @ np.ones(frames)
     left = NormalEquations(normal, right, energy, samples).left(flat)
     change = _most_likely(NormalEquations(normal, right - normal @ flat, left, samples))
@@ -84,7 +84,7 @@ def fit_brightness(
 
 def _views(segment: Segment, video: NDArray[Any], spatial_merge: int) -> tuple[NDArray[Any], NDArray[Any]]:
     """Return the video as each arm's sensor has it (time, block along the charge, block across)."""
-    # a picture that does not change is one frame, repeated without being copied
+    # A picture that does not change is one frame, repeated without being copied.
     frames = video[:1] if video.strides[0] == 0 else video
     views = seen_by_arms(segment, np.ascontiguousarray(frames, np.float32), spatial_merge)
     a, b = (np.broadcast_to(view, video.shape) for view in views)

@@ -125,8 +125,8 @@ def parameters(candidate: Candidate, frames: int, response: float) -> AdmmParame
     """
     w, extent = candidate.weight, (frames / USUAL_FRAMES) ** 0.5
     if candidate.prior == "still":
-        # all sub-steps add up in one frame, whose mean light outweighs a detail thousands of times: only
-        # small penalties and data steps run to their end recover the details
+        # All sub-steps add up in one frame, whose mean light outweighs a detail thousands of times: only
+        # small penalties and data steps run to their end recover the details.
         weight, penalty, steps = w * extent, 0.1 * w, STILL_STEPS
     elif candidate.prior == "smooth":
         weight, penalty, steps = w, 2e-3, 2

@@ -120,16 +120,16 @@ def _choose(bench: Workbench, volume: Trial, trials: int) -> Estimate:
     plain = bench.attempt(bench.fitting(STILL), FIRST_ITERATIONS)
     at_rest = plain.error < AT_REST and not bench.held_out.clearly_less(volume.errors, plain.errors)
     cosines = glance(given, plain.coefficients if at_rest else None)
-    # taken now, because the trials below forget how long the cosines' iterations are
+    # The time is taken now, because the trials below forget how long the cosines' iterations are.
     rest_s = (LONGER_LOOK - GLANCE) * clock.longest_s
     errors = bench.record_errors({"prior": "cosines"} | cosines.facts(), cosines.predict())
     at_a_glance, clear = bench.held_out.relative(errors), _has_clear_patterns(cosines)
     tried = _Tried(volume, plain)
-    # even where cosines are ahead: a scene that flickers gains 6.6 to 15 dB by this, a flame up to 3.5;
-    # evident lamps need the time for themselves
+    # These are tried even where cosines are ahead: a scene that flickers gains 6.6 to 15 dB by this, a flame
+    # up to 3.5. Evident lamps need the time for themselves.
     if not clear:
         tried.smooth = bench.probe(bench.fitting(SMOOTH), min(at_a_glance, tried.best.error))
-        # the first cosine is constant, so that this is the video's mean over time
+        # The first cosine is constant, so that this is the video's mean over time.
         picture = (cosines.basis.matrix()[0, 0] * host(cosines.solver.theta[0, ...])).clip(0)
         tried.bright = bench.brighten(picture, cosines.basis.cosines, min(at_a_glance, tried.best.error))
         period = find_period(cosines.solver.theta, cosines.basis)
@@ -195,7 +195,7 @@ def _search(bench: Workbench, tried: _Tried, trials: int, rival: float) -> Trial
     smooth = tried.smooth or bench.attempt(bench.fitting(SMOOTH), FIRST_ITERATIONS)
     volume = min((each for each in (tried.volume, calm, tried.cycle) if each is not None), key=_error)
     bright = tried.bright
-    # to a brightness, a flash in front of a still is the flash of everything
+    # To a brightness, a flash in front of a still is the flash of everything.
     flickers = bright is not None and bench.held_out.clearly_less(bright.errors, plain.errors)
     if bright is not None and flickers and bright.error < BRIGHTER * volume.error:
         volume = bright
@@ -203,7 +203,7 @@ def _search(bench: Workbench, tried: _Tried, trials: int, rival: float) -> Trial
         explains = plain.error < AT_REST
         merge = bench.given.options.spatial_merge
         still = best_still(plain, trials, merge=merge) if explains else bench.climb(plain, trials)
-    # where much moves, the still was not searched further, and is no ground for a change
+    # Where much moves, the still was not searched further, and is no ground for a change.
     if still is not plain:
         candidate = replace(weighted_like(still, bench.fitting(VOLUME)), change=True)
         change = change_bench(bench, still).attempt(candidate, FIRST_ITERATIONS)
@@ -216,8 +216,8 @@ def _search(bench: Workbench, tried: _Tried, trials: int, rival: float) -> Trial
             volume = volume.bench.follow_period(volume)
     if smooth.error < FAR * min(volume.error, rival):
         smooth = bench.climb(smooth, trials)
-    # beyond chance, which is worth 5 dB where something flashes; not required of other volumes, since ten
-    # blocks reject some of these that are 2 dB better
+    # The gain has to be beyond chance, which is worth 5 dB where something flashes. This is not required of
+    # other volumes, since ten blocks reject some of these that are 2 dB better.
     flows = smooth.error < SMOOTHER * volume.error and bench.held_out.clearly_less(
         smooth.errors, still.errors
     )

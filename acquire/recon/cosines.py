@@ -22,7 +22,7 @@ TENTATIVE_SHARE = 0.15
 """Share of the budget after which the search for the bandwidth hurries."""
 LAMPS_SHARE = 0.3
 """Share of the budget within which the search for the fastest lamp must end; otherwise it is skipped."""
-# 0.2 was a cliff on a busy host, where posing alone may take as much
+# A share of 0.2 was a cliff on a busy host, where posing alone may take as much.
 UNSEARCHED_SHARE = 0.4
 """Share of the budget that posing the problem may take; beyond it, the bandwidth is not searched for."""
 FEW_FRAMES = 32

@@ -117,7 +117,7 @@ class CurveFit:
         def normal(x: Array) -> Array:
             return exact.asarray(operator.adjoint(operator.forward(arrays.asarray(x)))) + damping * x
 
-        # the damping holds back the change, the prior the curves: only the latter pulls at the start
+        # The damping holds back the change, the prior the curves: only the latter pulls at the start.
         right = exact.asarray(gradient - precision * start)
         change = _conjugate_gradients(normal, right, self._precondition, STEPS if small else PLAIN_STEPS)
         fitted: NDArray[np.float64] = start + host(change)
@@ -134,15 +134,16 @@ class CurveFit:
         """
         cosines, rank = start.shape
         samples = int(np.count_nonzero(self._problem.weight))
-        # as if the masked samples were spread evenly, which is near enough for a preconditioner and a prior
+        # The masked samples are taken to be spread evenly, which is near enough for a preconditioner and a
+        # prior.
         gram *= samples / self._problem.weight.size / self._problem.norm**2
         self._damping = max(self._ridge * float(np.trace(gram)) / len(gram), float(np.finfo(np.float32).tiny))
-        # in the order of `gram`: all cosines of a pattern, then those of the next
+        # These are in the order of `gram`: all cosines of a pattern, then those of the next.
         before, slope = start.T.ravel().astype(np.float64), gradient.T.ravel().astype(np.float64)
         if self._learns and self.prior is None and start.any():
-            # to begin with, the curves as they are and all of the residual as noise
+            # The first prior takes the curves as they are, and all of the residual as noise.
             likely = np.square(start, dtype=np.float64).mean(1)
-            # of cosines that were not solved for nothing is known, and without light they would stay dark
+            # Nothing is known of cosines that were not solved for, and without light they would stay dark.
             likely[likely == 0] = np.median(likely[likely > 0])
             self.prior = CurvePrior(likely, energy / samples)
         equations, diagonal = NormalEquations(gram, slope, energy, samples), np.diag_indices_from(gram)
@@ -179,13 +180,13 @@ class CurveOperator:
         self._arrays, self._xp = cosines.arrays, cosines.arrays.xp
         self._width = segment.geometry.size + segment.geometry.substeps - 1
         substeps = np.arange(segment.geometry.span)
-        # (line, s): the n + S − 1 sub-steps that a line integrates
+        # (line, s): the n + S − 1 sub-steps that a line integrates.
         windows = np.asarray(self._firsts)[:, None] + np.arange(self._width)
         self._frame = self._arrays.indices(substeps // temporal_merge)
         self._windows = self._arrays.indices(windows.ravel())
         self._code = self._arrays.asarray(segment.code)
         view_a, view_b = seen_by_arms(segment, patterns, 1, self._arrays)
-        # arm B's rows are the scene's columns from right to left
+        # Arm B's rows are the scene's columns from right to left.
         views = (view_a, self._xp.flip(self._xp.permute_dims(view_b, (0, 2, 1)), axis=1))
         merging = self._arrays.asarray(column_merging(segment.geometry, 1))
         self._profiles = [_profiles(self._xp, view, merging, segment.geometry.substeps) for view in views]
@@ -205,12 +206,12 @@ class CurveOperator:
         back = lines[0, ...] @ a.T + lines[1, ...] @ b.T
         windows = xp.permute_dims(xp.reshape(back, (-1, self._rank, self._width)), (0, 2, 1))
         light = self._arrays.zeros((self._geometry.span, self._rank))
-        # windows overlap, and the array API has no addition at repeated indices
+        # Windows overlap, and the array API has no addition at repeated indices.
         for line, first in enumerate(self._firsts):
             light[first : first + self._width, :] += windows[line, ...]
         light = light * self._code[:, None]
         if self._merge > 1:
-            # dark sub-steps complete the last frame
+            # Dark sub-steps complete the last frame.
             missing = -light.shape[0] % self._merge
             dark = xp.zeros((missing, light.shape[1]), dtype=light.dtype, device=light.device)
             frames = xp.reshape(xp.concat([light, dark]), (-1, self._merge, light.shape[1]))
@@ -221,16 +222,16 @@ class CurveOperator:
         """The normal matrix of all samples in float64, unknowns in the order of (R, K)."""
         xp, K, R, exact = self._xp, self._matrix.shape[0], self._rank, self._arrays.exact()
         gram = exact.zeros((R, K, R, K))
-        # elsewhere G is 0
+        # Elsewhere G is 0.
         lit = self._arrays.indices(np.flatnonzero(host(self._code)))
-        # float64: rounding in float32 could make it indefinite
+        # float64 is needed: rounding in float32 could make it indefinite.
         cosines = exact.asarray(xp.take(self._matrix, xp.take(self._frame, lit), axis=1))
         cosines *= exact.asarray(xp.take(self._code, lit))
         shaped = [xp.reshape(exact.asarray(each), (R, self._width, -1)) for each in self._profiles]
         for k in range(R):
             for other in range(k + 1):
                 Q = sum(each[k, ...] @ each[other, ...].T for each in shaped)
-                # Σ_i Q(t − iS, t' − iS), of which only the sub-steps with light count
+                # This is Σ_i Q(t − iS, t' − iS), of which only the sub-steps with light count.
                 between = self._shifted(Q, self._geometry.lines)
                 between = xp.take(xp.take(between, lit, axis=0), lit, axis=1)
                 pair = cosines @ between @ cosines.T
@@ -241,7 +242,7 @@ class CurveOperator:
         """Σ_i Q shifted by iS in both directions, from the sum for half of the lines."""
         if lines == 1:
             return Q
-        # doubling adds up log₂ L large matrices instead of L
+        # Doubling adds up log₂ L large matrices instead of L.
         half, S = self._shifted(Q, lines // 2), self._geometry.substeps
         parts = [(0, half), (lines // 2 * S, half)] + [((lines - 1) * S, Q)] * (lines % 2)
         span = self._width + (lines - 1) * S
@@ -268,7 +269,7 @@ def _conjugate_gradients(
         if not energy > 0 or not curvature > 0:
             break
         x += (energy / curvature) * direction
-        # not in place: in the first step it is still the caller's `right`
+        # Not in place: in the first step it is still the caller's `right`.
         residual = residual - (energy / curvature) * image
         scaled = precondition(residual)
         energy, before = float(dot(residual, scaled)), energy

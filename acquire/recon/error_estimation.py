@@ -71,7 +71,7 @@ def estimate_error(
     if not (isinstance(estimate, Continuable) and problem.held_out.any()):
         return UNSUPPORTED
     began_s = clock.processor_s
-    # before there is a second video: of a large sensor, each is a gigabyte
+    # It is measured before there is a second video: of a large sensor, each is a gigabyte.
     white = white_error(segment, problem, given.merges)
     facts = estimate.facts()
     at_rest = facts.get("prior") == "still" or bool(facts.get("change"))
@@ -103,7 +103,7 @@ def estimate_error(
 
 def _with_fewer_lines(problem: Problem, estimate: Continuable, clock: IterationClock) -> Continued | str:
     """The video with another quarter of the lines withheld."""
-    # blocks of their own: those that the solver was judged by are in use meanwhile
+    # It gets blocks of its own: those that the solver was judged by are in use meanwhile.
     withheld = held_out_blocks(problem.usable, WITHHELD, WITHHELD_SEED)
     continuation = estimate.continue_with(problem.holding_out(withheld))
     if continuation is None:
@@ -128,7 +128,7 @@ def _under_heavier_prior(
         continuation.step()
     if made < FEWEST_HEAVIER:
         return NO_TIME
-    # the drift's growth over the last half or more of the iterations
+    # The drift is the growth over the last half or more of the iterations.
     last = max(distances, default=0)
     early = max((each for each in distances if each <= last / 2), default=None)
     if early is None:
@@ -137,7 +137,7 @@ def _under_heavier_prior(
         floor = max(BY_PRIOR.floor * full_scale(video[trusted]), 1e-30)
         change = [np.hypot(distances[each], floor) for each in (early, last)]
         drift = float(np.clip(np.log(change[1] / change[0]) / np.log(last / early), -1, 1))
-    # a negative drift is that of a solver that converges: its change is not extrapolated to a smaller one
+    # A negative drift is that of a solver that converges: its change is not extrapolated to a smaller one.
     return Continued(continuation.video(), made, max(drift, 0.0), drift)
 
 
@@ -179,8 +179,8 @@ def white_error(segment: Segment, problem: Problem, merges: tuple[int, int]) -> 
     operator = DualArm(
         segment.geometry, segment.code, *merges, alignment=segment.alignment, blur=segment.blur
     )
-    # random signs show the energy of independent errors, Σ of Λ′'s squared elements, without the matrix, and
-    # their RMS is exactly 1; from int8 and in place, because a video can be large
+    # Random signs show the energy of independent errors, Σ of Λ′'s squared elements, without the matrix, and
+    # their RMS is exactly 1. They are made from int8 and in place, because a video can be large.
     signs = np.random.default_rng(0).integers(0, 2, operator.video_shape, np.int8).astype(np.float32)
     signs *= 2
     signs -= 1

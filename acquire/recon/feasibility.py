@@ -33,11 +33,11 @@ def least_seconds(geometry: Geometry, spatial_merge: int, temporal_merge: int, s
     """Wall time of the shortest reconstruction of such a segment, within a factor of two."""
     few = Geometry(geometry.stages, geometry.substeps, max(1, geometry.lines // PROBED_SHARE))
     code = np.random.default_rng(0).integers(0, 2, few.span).astype(np.uint8)
-    # a sixth of the lines may be shorter than a voxel
+    # A sixth of the lines may be shorter than a voxel.
     operator = DualArm(few, code, spatial_merge, min(temporal_merge, few.span))
     video = np.ones(operator.video_shape, np.float32)
     operator.adjoint(operator.forward(video))  # loads the compiled loops
-    # processor time, which a busy machine does not stretch; `slowness` says by how much wall time is longer
+    # A busy machine does not stretch processor time; `slowness` says by how much wall time is longer.
     used, passes = time.thread_time(), 0
     while passes < 1 or time.thread_time() - used < PROBE_S:
         operator.adjoint(operator.forward(video))

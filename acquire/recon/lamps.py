@@ -98,7 +98,7 @@ def last_lamp(
             most = int(share * looked_at)
             factor = _factor(geometry, code, temporal_merge, most)
             energy = _relative_energy(factor, problem.samples[:, lines], seen, hurry)
-            # as a share of the part's cosines: their spacing depends on its length
+            # The result is a share of the part's cosines: their spacing depends on its length.
             last = max(last, _end_of_peaks(energy, most) / looked_at)
     return round(last * frames)
 
@@ -114,16 +114,16 @@ def _relative_energy(
     All 0 if the lines do not separate the cosines.
     """
     K, rows, L = factor.shape
-    # pixels of both arms alike: C sums over rows, so that their order does not matter
+    # The pixels of both arms are alike: C sums over rows, so that their order does not matter.
     pixels, seen = np.hstack(list(samples)), np.hstack(list(usable))
     kept = seen.any(0)
     pixels, seen = pixels[:, kept].astype(np.float32), seen[:, kept]
-    # mean square 1, which the first values of light and noise presuppose
+    # The mean square becomes 1, which the first values of light and noise presuppose.
     pixels /= max(np.sqrt(np.square(pixels, dtype=np.float64).sum() / seen.sum()), np.finfo(np.float32).tiny)
     response = np.square(factor).sum((1, 2), dtype=np.float64)
     if not response.min() > LEAST_RESPONSE * response.max():
         return np.zeros(K)
-    # to begin with, all cosines have the same share, and together half of the mean square
+    # At first, all cosines have the same share, and together half of the mean square.
     light, noise = 0.5 * L / (K * response), 1e-3
     chunk = max(1, CHUNK_BYTES // (4 * rows * L))
     chunks = [slice(k, k + chunk) for k in range(0, K, chunk)]
@@ -140,9 +140,9 @@ def _relative_energy(
         samples_each = seen.mean() * seen.shape[1]
         largest = float(np.finfo(np.float32).max) * min(trace, float(expected.min())) * samples_each
         if not (light * explained).max() < largest:
-            # rounding error: under a code that hardly changes, the lines do not separate cosines
+            # This is rounding error: under a code that hardly changes, the lines do not separate cosines.
             return np.zeros(K)
-        # the root is that of the minorisation: the likelihood rises in every step, whatever the start
+        # The root is that of the minorisation: the likelihood rises in every step, whatever the start.
         light *= np.sqrt(explained / (samples_each * expected))
         left = np.square(white, dtype=np.float64).sum() / samples_each
         noise = max(LEAST_NOISE, noise * float(np.sqrt(left / trace)))
@@ -160,7 +160,7 @@ def _factor(
     frames = geometry.video_shape(1, temporal_merge)[0]
     count = max(most, min(frames // 2, FEWEST_LOOKED_AT))
     basis, merge = TemporalBasis(frames, count), geometry.substeps
-    # rows are as wide as pixels, or wider where the factor would take too much memory
+    # Rows are as wide as pixels, or wider where the factor would take too much memory.
     while 4 * basis.count * geometry.lines * geometry.size > LARGEST_FACTOR_BYTES * merge:
         merge += geometry.substeps
     starts, lengths = block_bounds(geometry.size, merge)
@@ -189,7 +189,7 @@ def _whitened(
     holes = ~seen
     if not holes.any():
         return white
-    # pixels with the same holes share the inverse of a small matrix
+    # Pixels with the same holes share the inverse of a small matrix.
     patterns, of = np.unique(holes, axis=1, return_inverse=True)
     for number, hole in enumerate(patterns.T):
         if hole.any():
@@ -206,8 +206,8 @@ def _left_out(
 ) -> float:
     """For one cosine (rows, L_R): energy that it explains if C is without it, relative to that by chance."""
     own = (flat @ inverse @ flat.T).astype(np.float64)
-    # F_kᵀ·(C − p·F_k·F_kᵀ)⁻¹ = (I − p·F_kᵀ·C⁻¹·F_k)⁻¹·F_kᵀ·C⁻¹
-    # slightly more than 1, because a cosine that is all of C would make it singular
+    # F_kᵀ·(C − p·F_k·F_kᵀ)⁻¹ = (I − p·F_kᵀ·C⁻¹·F_k)⁻¹·F_kᵀ·C⁻¹. The diagonal is slightly more than 1, because
+    # a cosine that is all of C would make it singular.
     without = np.linalg.inv((1 + 1e-6) * np.eye(len(own)) - light * own)
     expected = float(np.einsum("ij,ji->", without, own))
     explained = float(np.square(without.astype(np.float32) @ (flat @ white)).sum(dtype=np.float64))

@@ -101,10 +101,10 @@ def find_patterns(theta: NDArray[Any], *, beyond_doubt: bool = False) -> Pattern
     if count <= TAIL:
         return None
     flat = theta.reshape(count, -1).astype(np.float64)
-    # of a K × K matrix: there are many more pixels than cosines
+    # The matrix is K × K: there are many more pixels than cosines.
     energy, vectors = np.linalg.eigh(flat @ flat.T)
     energy, vectors = np.maximum(energy[::-1], 0), vectors[:, ::-1]
-    # energies are squares of singular values, for whose ratios the limits are given
+    # Energies are squares of singular values, for whose ratios the limits are given.
     gaps = np.flatnonzero(energy[: TAIL - 1] > GAP**2 * energy[1:TAIL]) + 1
     rank = int(gaps[-1]) if len(gaps) else 0
     if not _is_enough(rank, energy, LARGEST_REST_AT_GAP):
@@ -224,7 +224,7 @@ class Refinement:
         self._steps = 0
         self._fit = self._new_fit()
         n, merge = given.segment.geometry.size, given.options.spatial_merge
-        # a voxel held over its pixels; the last may stand out of the picture
+        # A voxel is held over its pixels; the last may stand out of the picture.
         fine = found.patterns.repeat(merge, axis=1).repeat(merge, axis=2)[:, :n, :n]
         self._start(replace(found, patterns=fine))
 
@@ -234,7 +234,7 @@ class Refinement:
         operator, basis = self._operators()
         fine, start = host(found.patterns), self._theta
         size = np.sqrt(np.square(fine, dtype=np.float64).sum((1, 2)))
-        # 1e-6: of a pattern that has faded altogether the weight stays finite
+        # With 1e-6, the weight of a pattern that has faded altogether stays finite.
         emphasis = (size.max() / np.maximum(size, 1e-6 * size.max() + 1e-30)) ** FADING
         self._admm = Admm(
             operator,
@@ -298,13 +298,14 @@ class Refinement:
     def return_to(self, found: Patterns) -> None:
         """Make ``found``, the result of an earlier round, the estimate."""
         self.found = found
-        # sets the operator of these curves, which `predict` needs
+        # This sets the operator of these curves, which `predict` needs.
         self._operators()
 
     def restricted(self, found: Patterns) -> Refinement:
         """A refinement that continues from here with fewer patterns, in pixels; this one stays as it is."""
         other = copy(self)
-        # from the present state: fewer patterns that start from voxels have not yet taken their light back
+        # It starts from the present state: fewer patterns that start from voxels have not yet taken their
+        # light back.
         other._start(found)
         other._fit = other._new_fit()
         other._fit.prior = self._fit.prior
@@ -334,7 +335,7 @@ class Refinement:
         """
         found, flat = self.found, host(self.found.patterns).reshape(self.rank, -1).astype(np.float64)
         _, turn = np.linalg.eigh(flat @ flat.T)
-        # in principal axes, strongest first, the last patterns hold the least light
+        # In principal axes, strongest first, the last patterns hold the least light.
         turn = turn[:, ::-1].astype(found.curves.dtype)
 
         def strongest(count: int) -> Patterns:
@@ -351,7 +352,7 @@ class Refinement:
 
         excess, needed = beyond_noise(), self.rank
         while needed > 1:
-            # only to predict with fewer: the present ones come back below
+            # This is only to predict with fewer: the present ones come back below.
             self.return_to(strongest(needed - 1))
             without = beyond_noise()
             if not without < NEEDED * excess:
@@ -385,16 +386,16 @@ class Refinement:
         arrays, exact = problem.arrays, problem.arrays.exact()
         flat = exact.xp.reshape(exact.asarray(patterns), (self.rank, -1))
         gram = host(flat @ flat.T)
-        # the ridge keeps patterns that have become alike, or dark, from making it singular
+        # The ridge keeps patterns that have become alike, or dark, from making it singular.
         root = np.linalg.cholesky(gram + 1e-6 * np.trace(gram) * np.eye(self.rank))
-        # orthonormal patterns make the fit well conditioned; the curves take over their sizes for it
+        # Orthonormal patterns make the fit well conditioned; the curves take over their sizes for it.
         unit = arrays.xp.reshape(arrays.asarray(exact.asarray(np.linalg.inv(root)) @ flat), patterns.shape)
-        # curves of unit patterns, and then (solve) of the patterns as they were
         other = self._unknowns.other_lines(self.found)
         known = None if other is None else host(other) / problem.norm
+        # These are the curves of unit patterns, and then (solve) of the patterns as they were.
         fitted = self._fit(unit, self.found.curves @ root, known)
         left, middle, right = np.linalg.svd(np.linalg.solve(root.T, fitted.T).T, full_matrices=False)
-        # left·right is the nearest orthonormal matrix; the patterns take the rest, so that Θ stays the same
+        # Left·right is the nearest orthonormal matrix; the patterns take the rest, so that Θ stays the same.
         rotated = exact.asarray((right.T * middle) @ right) @ flat
         patterns = arrays.xp.reshape(arrays.asarray(rotated), patterns.shape)
         self.found = replace(self.found, curves=(left @ right).astype(arrays.dtype), patterns=patterns)

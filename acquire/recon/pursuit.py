@@ -66,7 +66,7 @@ def pursue(
     """
     frames = given.video_shape[0]
     fastest = reachable(frames, given.options.temporal_merge, FASTEST_SHARE)
-    # as for the search of a band: few cosines have no median that lamps could stand out of
+    # As in the search of a band, few cosines have no median that lamps could stand out of.
     if fastest < 2 * FEWEST_COEFFICIENTS:
         return None
     residual_energy = _spectrum(given, fastest)
@@ -97,7 +97,7 @@ def pursue(
         look = look.moved(_windows(np.concatenate([lamps, NO_COSINES if told is None else told]), fastest))
     if told is None or not len(sure):
         return None
-    # what is slower than a lamp costs little
+    # What is slower than a lamp costs little.
     lamps = np.concatenate([lamps[lamps <= sure.max()], told])
     return look.moved(_windows(lamps, fastest)).estimate
 

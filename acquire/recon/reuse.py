@@ -55,7 +55,7 @@ class Choice:
     def of(cls, result: Reconstruction) -> Self | None:
         """The choice of a reconstruction; None if nothing was chosen, or if it depends on an object there."""
         found, quality = result.parameters, result.quality
-        # robust weights and a change's still are of this segment's lines
+        # Robust weights and a change's still are of this segment's lines.
         if "candidates" not in found or found.get("robust") or found.get("change"):
             return None
         counts = [
@@ -64,7 +64,7 @@ class Choice:
         in_cosines, cyclic = found["prior"] == COSINES_PRIOR, "harmonics" in found
         return cls(
             prior=found["prior"],
-            # of a cycle, the cosines up to its fastest harmonic are not what is solved for
+            # In a cycle, the cosines up to its fastest harmonic are not what is solved for.
             coefficients=2 * found["harmonics"] + 1 if cyclic else found["temporal_coefficients"],
             weight=0.0 if in_cosines else found["weight"],
             pace=0.0 if in_cosines else found["pace"],
@@ -113,7 +113,7 @@ def reuse_choice(bench: Workbench, trials: int) -> Estimate | None:
     else:
         still = bench.attempt(bench.fitting(STILL), FIRST_ITERATIONS)
     fits = at_rest and choice.fits(still.error, noise)
-    # if noise is all that a still leaves, nothing has to move
+    # If noise is all that a still leaves, nothing has to move.
     if fits or still.error <= AS_CLOSELY * noise or clock.spent(SEARCH_SHARE):
         return bench.finish(_strengthened(still))
     if at_rest:
@@ -129,7 +129,7 @@ def reuse_choice(bench: Workbench, trials: int) -> Estimate | None:
             return None
     moving = bench.attempt(choice.candidate(frames), FIRST_ITERATIONS, bright)
     if choice.period_frames:
-        # what was handed over had more iterations
+        # What was handed over had more iterations.
         moving = bench.follow_period(moving)
         moving = bench.attempt(moving.candidate, NEXT_ITERATIONS, moving)
     best = moving if bench.held_out.clearly_less(moving.errors, still.errors) else still
@@ -154,7 +154,7 @@ def _in_cosines(bench: Workbench, still: Trial) -> Estimate | None:
     assert choice is not None
     band = replace(bench.given.options, bandwidth=min(1.0, choice.coefficients / bench.frames))
     given = replace(bench.given, options=band)
-    # as in `choose`: from a start at zero the code would stay in the brightness
+    # As in `choose`, the code would stay in the brightness from a start at zero.
     start = still.admm.theta if still.error < AT_REST else None
     cosines = first_look(given, start)
     bench.record_errors({"prior": COSINES_PRIOR} | cosines.facts(), cosines.predict())

@@ -52,11 +52,11 @@ def unusable(segment: Segment) -> list[Suspicion]:
         known = np.where(mask, lines, np.nan)
         seen = np.isfinite(known).any(0)
         lowest, highest = np.nanmin(known[:, seen], axis=0), np.nanmax(known[:, seen], axis=0)
-        # a single line cannot change, and darkness does not
+        # A single line cannot change, and darkness does not.
         if segment.geometry.lines == 1 or not highest.any():
             continue
         still = lowest == highest
-        # a constant column at the lowest level may be dark, and is no evidence
+        # A constant column at the lowest level may be dark, and is no evidence.
         lit = ~still | (highest > lowest.min())
         share = 1.0 if still.all() else float(still[lit].mean())
         if share > STUCK_SHARE:
@@ -119,7 +119,7 @@ def _constant(name: str, lines: Floats, model: Model, mean: float) -> list[Suspi
 
 def _little_light(name: str, lines: Floats, model: Model, mean: float) -> list[Suspicion]:
     modes = model.modes(lines)
-    # the prior's noise is a power of ten; electrons need it more precisely
+    # The prior's noise is a power of ten; electrons need it more precisely.
     noisy = max(
         (model.with_noise(model.prior.noise * step) for step in NOISE_STEPS),
         key=lambda each: each.evidence(modes),

@@ -114,7 +114,7 @@ def inquire(model: LineModel) -> Inquiry:
     model.prior = USUAL_PRIOR
     substeps = max(others, key=lambda each: _contrast(model, each).contrast).substeps
     other = _inquire(model, substeps)
-    # no other change is accepted with another S: with all delays to choose from, chance finds something
+    # With another S, no other change is accepted: with all delays to choose from, chance finds something.
     explained = other.best.agreement >= VERIFIED_ALONE and other.best.hypothesis.changes == 0
     if explained and other.best.gain > inquiry.best.gain + CLEAR:
         return replace(other, standing=Standing.NAMED, described=inquiry.described)
@@ -173,11 +173,12 @@ def _search(model: LineModel, plain: Hypothesis) -> tuple[Candidate, tuple[Candi
     Among candidates that are not clearly different, the one that changes least of the description is first.
     """
     model.fit_prior(plain)
-    # after the prior: agreement by chance depends on it
+    # This comes after the prior: agreement by chance depends on it.
     chance = ByChance.of(model, plain)
     described = chance.judged(_contrast(model, plain))
     found = []
-    # two: at delays three apart, or turned scenes that look alike, the right orientation may be second
+    # Two are tried: at delays three apart, or turned scenes that look alike, the right orientation may be
+    # second.
     for start in _first_look(model, plain)[:2]:
         climbed = _climb(model, start.hypothesis)
         found.append(described if climbed == plain else chance.judged(_contrast(model, climbed)))
@@ -203,7 +204,7 @@ class ByChance:
             _contrast(model, replace(plain, random_code=number)) for number in range(1, RANDOM_CODES + 1)
         ]
         own = np.array([each.evidence.own.sum() for each in found])
-        # the most that chance reached, not its mean: a code has to be clear of all of them
+        # This is the most that chance reached, not its mean: a code has to be clear of all of them.
         contrast = max(each.contrast for each in found)
         gain = max(each.gain for each in found)
         floor = LEAST_CONTRAST
@@ -212,7 +213,7 @@ class ByChance:
     def judged(self, candidate: Candidate) -> Candidate:
         """The candidate with its agreement, and its own evidence, relative to chance."""
         beyond = (float(candidate.evidence.own.sum()) - self.own) / max(self.spread, 1e-9)
-        # a scene that looks the same turned has no contrast, and yet the arms agree on it
+        # A scene that looks the same turned has no contrast, and yet the arms agree on it.
         agreement = max(candidate.contrast / self.contrast, candidate.gain / self.gain)
         return replace(candidate, agreement=agreement, beyond=beyond)
 
@@ -256,7 +257,7 @@ def _climb(model: LineModel, start: Hypothesis) -> Hypothesis:
             known[late] = float(model.evidence(replace(start, late=late)).mutual.sum())
         return known[late]
 
-    # both climbs try some of the same delays
+    # Both climbs try some of the same delays.
     known: dict[tuple[int, int], float] = {}
     common = _uphill(gain, start.late, ((3, 3), (1, 1)))
     apart = _uphill(gain, common, ((3, 0), (0, 3), (1, 0), (0, 1)))

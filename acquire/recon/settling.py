@@ -65,14 +65,14 @@ def settle(given: Given, refinement: Refinement) -> Refinement:
     if course.refine_until_idle(clock, LOOSENED_IN_VAIN, TRIAL_AFTER * ROUND):
         course.hold(course.likely_weight)
     course.continue_with(_without_doubtful(given, course.refinement))
-    # not held yet if no noise was fitted within `TRIAL_AFTER` rounds
+    # λ is not held yet if no noise was fitted within `TRIAL_AFTER` rounds.
     if course.refinement.loosens and course.refine_until_idle(clock, LOOSENED_IN_VAIN):
         course.hold(course.likely_weight)
     while course.refine_until_idle(clock, PATIENCE):
         if course.recent >= (1 - LEAST_PROGRESS) * course.before:
             clock.converged()
             break
-        # by the used samples: the held-out ones rise and fall by more than λ changes them
+        # The used samples decide: the held-out ones rise and fall by more than λ changes them.
         step = TIGHTER if course.fits_noise else 1 / TIGHTER
         course.hold(step * course.refinement.parameters.tv_weight)
     return course.at_best()
@@ -91,7 +91,7 @@ class _Course:
         self.recent = self.before = np.inf
         self._best, self._kept, self._idle = np.inf, (refinement, refinement.found), 0
         self._loosened = [(np.inf, refinement.parameters.tv_weight)]
-        # an RMS of N values has a relative standard error of 1/√(2N)
+        # An RMS of N values has a relative standard error of 1/√(2N).
         self._doubt = BEYOND_CHANCE / np.sqrt(2 * max(1, given.problem.held_out.sum()))
 
     def refine_until_idle(self, clock: IterationClock, patience: int, most: int | None = None) -> bool:
@@ -104,11 +104,11 @@ class _Course:
                 predicted = self.refinement.predict()
                 error = self._problem.prediction_error(predicted)
                 self.fits_noise = self._problem.misfit(predicted) < self._noise
-                # without held-out samples the error is NaN, which never counts as idle
+                # Without held-out samples the error is NaN, which never counts as idle.
                 least_gain = LEAST_PROGRESS if self.refinement.loosens else LEAST_PROGRESS_HELD
                 self._idle = self._idle + 1 if error >= (1 - least_gain) * self.recent else 0
                 self.recent = min(self.recent, error)
-                # NaN, without held-out samples, makes the last round the best
+                # A NaN, without held-out samples, makes the last round the best.
                 if not error >= self._best:
                     self._best, self._kept = error, (self.refinement, self.refinement.found)
                 if self.refinement.loosens:

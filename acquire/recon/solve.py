@@ -60,7 +60,7 @@ def solve_twist(given: Given, *, banded: bool) -> Estimate:
     segment, problem, options, shape = given.segment, given.problem, given.options, given.video_shape
     count = find_band(given) if banded else shape[0]
     basis = TemporalBasis(shape[0], count, problem.arrays)
-    # with all cosines, the shear is less work than dense factors
+    # With all cosines, the shear is less work than dense factors.
     make = band_operator if banded else InBasis
     operator = make(
         segment.geometry,
@@ -100,13 +100,14 @@ class KnownImage:
         self._problem = problem = given.problem.on_host()
         arrays = problem.arrays
         self._image = image.astype(arrays.dtype)
-        # no band: with the picture known, the lines determine its light up to pulses of single sub-steps
+        # There is no band: with the picture known, the lines determine its light up to pulses of single
+        # sub-steps.
         basis = TemporalBasis(frames, frames, arrays)
-        # unit norm, whatever the image's units, so that the fit's ridge means the same
+        # The norm is 1, whatever the image's units, so that the fit's ridge means the same.
         patterns = self._image[None] / np.linalg.norm(self._image)
         self._operator = CurveOperator(segment, patterns, basis, temporal_merge)
         coefficients = np.zeros((frames, 1))
-        # a single iteration, but one of the clock's, so that progress and time are counted
+        # There is a single iteration, but one of the clock's, so that progress and time are counted.
         for _ in given.clock.run(1, "light"):
             coefficients = CurveFit(segment, problem, basis, temporal_merge)(patterns, coefficients)
         self._coefficients = arrays.asarray(coefficients)

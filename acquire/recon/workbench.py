@@ -125,10 +125,11 @@ class Workbench:
         self.frames, self._side, _ = given.segment.geometry.video_shape(*self._merges)
         self._brightness: NDArray[Any] | None = None  # of the next trials; a trial keeps its own
         self._bright_cosines = self.frames
-        # successive trials mostly share one
+        # Successive trials mostly share one.
         self._operators: dict[tuple[int, bool, float], Operator] = {}
 
-        # energy of the normalised lines' response to steady light in the voxel in the middle of the picture
+        # This is the energy of the normalised lines' response to steady light in the voxel in the middle of
+        # the picture.
         constant = TemporalBasis(self.frames, 1, self.problem.arrays)
         point = np.zeros((1, self._side, self._side))
         point[0, self._side // 2, self._side // 2] = 1
@@ -242,7 +243,7 @@ class Workbench:
 
     def _use_brightness(self, brightness: NDArray[Any] | None) -> None:
         self._brightness = brightness
-        # operators that contain the former brightness are out of date
+        # Operators that contain the former brightness are out of date.
         self._operators = {key: kept for key, kept in self._operators.items() if not key[1]}
 
     def fitting(self, candidate: Candidate) -> Candidate:
@@ -271,7 +272,7 @@ class Workbench:
             denoiser=denoiser,
             background=self._background(basis),
         )
-        # multipliers and w fit only as many unknowns of the same kind
+        # Multipliers and w fit only as many unknowns of the same kind.
         if (
             start is not None
             and start.bench.fine == self.fine

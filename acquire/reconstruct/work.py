@@ -160,7 +160,7 @@ def solve(task: Task, watch: Watch) -> Part:
         refuse=False,  # a task that was started ends regularly
         **keywords,
     )
-    # the rest: an early end leaves part of the iterations undone
+    # The rest is reported: an early end leaves part of the iterations undone.
     watch.advance(1 - done)
     substeps = lines.geometry.substeps
     doubt = _why_not_trusted(result, segment)
@@ -194,7 +194,7 @@ def solve(task: Task, watch: Watch) -> Part:
                 for name, value in asdict(result.quality).items()
             },
         },
-        # a search that was stopped has not chosen
+        # A search that was stopped has not chosen.
         choice=Choice.of(result) if result.believed and result.ended != "stopped" else None,
     )
 
@@ -210,7 +210,7 @@ def _why_not_trusted(result: Reconstruction, segment: SubSegment) -> str | None:
     """Return why no frame is trusted, or None: the run was stopped, or too short to explain its lines."""
     if not result.believed:
         return "no frame of it is trusted: the lines contradict the recording's description of them"
-    # a run ended by its budget is trusted if it explains its lines; one that was stopped never is
+    # A run ended by its budget is trusted if it explains its lines; one that was stopped never is.
     missed = float(np.nanmax([result.quality.misfit, result.quality.prediction]))
     if result.ended != "stopped" and (result.ended != "budget" or missed <= POOR_MISFIT):
         return None
