@@ -35,7 +35,7 @@ from acquire.recon.cosines import (
     find_band,
 )
 from acquire.recon.estimates import InBand, Refined
-from acquire.recon.patterns import PARAMETERS, ROUND, Refinement, find_patterns
+from acquire.recon.patterns import PARAMETERS, ROUND, Refinement, find_patterns, has_clear_patterns
 from acquire.recon.pursuit import pursue, widened
 from acquire.recon.settling import BETTER_BESIDE_MOTION, better_than, early_error, has_time, settle
 
@@ -222,7 +222,7 @@ def complete_look(given: Given, first: InBand) -> None:
         rest = _at_most(look, given) - clock.done
         for _ in clock.run(rest, "first look", FIRST_LOOK_SHARE, first.video):
             first.solver.step()
-        if find_patterns(host(first.solver.theta), beyond_doubt=True) or clock.spent(LONGER_SHARE):
+        if has_clear_patterns(first) or clock.spent(LONGER_SHARE):
             break
 
 
@@ -258,7 +258,7 @@ def _in_patterns(given: Given, first: InBand) -> Estimate | None:
     explained = max(SOON_EXPLAINED * noise, LEAST_MISSED) if noise < np.inf else LEAST_MISSED  # NaN: unknown
     clock.reset()  # the limit holds for each stage: the first look takes longer where patterns are in doubt
     refinement = None
-    if rivals and find_patterns(theta, beyond_doubt=True) is None and has_time(clock):
+    if rivals and not has_clear_patterns(first) and has_time(clock):
         refinement = _beside_motion(given, usual, rivals, min(error, explained))
         rivals = []
     if refinement is None and usual is not None:

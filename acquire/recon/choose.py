@@ -37,7 +37,7 @@ from acquire.recon.cycle import find_period
 from acquire.recon.estimates import Preferred, Refined
 from acquire.recon.given import Given
 from acquire.recon.holdout import HeldOut
-from acquire.recon.patterns import find_patterns
+from acquire.recon.patterns import find_patterns, has_clear_patterns
 from acquire.recon.reuse import reuse_choice
 from acquire.recon.solver import Preset, Solver
 from acquire.recon.still import best_still, change_bench, weighted_like
@@ -123,7 +123,7 @@ def _choose(bench: Workbench, volume: Trial, trials: int) -> Estimate:
     # The time is taken now, because the trials below forget how long the cosines' iterations are.
     rest_s = (LONGER_LOOK - GLANCE) * clock.longest_s
     errors = bench.record_errors({"prior": "cosines"} | cosines.facts(), cosines.predict())
-    at_a_glance, clear = bench.held_out.relative(errors), _has_clear_patterns(cosines)
+    at_a_glance, clear = bench.held_out.relative(errors), has_clear_patterns(cosines)
     tried = _Tried(volume, plain)
     # These are tried even where cosines are ahead: a scene that flickers gains 6.6 to 15 dB by this, a flame
     # up to 3.5. Evident lamps need the time for themselves.
@@ -231,12 +231,8 @@ def _worth_refining(bench: Workbench, cosines: InBand, best: Trial) -> bool:
     error = bench.error(cosines.predict())
     if error < CLOSE * best.error:
         return True
-    return error <= NOT_FAR * best.error and _has_clear_patterns(cosines)
+    return error <= NOT_FAR * best.error and has_clear_patterns(cosines)
 
 
 def _error(trial: Trial) -> float:
     return trial.error
-
-
-def _has_clear_patterns(cosines: InBand) -> bool:
-    return find_patterns(host(cosines.solver.theta), beyond_doubt=True) is not None

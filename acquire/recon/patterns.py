@@ -34,6 +34,7 @@ if TYPE_CHECKING:
 
     from acquire.arrays import Array
     from acquire.recon.basis import TemporalBasis
+    from acquire.recon.estimates import InBand
     from acquire.recon.given import Given
     from acquire.recon.problem import MaskedOperator, Operator, Problem
 
@@ -117,6 +118,11 @@ def find_patterns(theta: NDArray[Any], *, beyond_doubt: bool = False) -> Pattern
             return None
     curves = vectors[:, :rank].astype(theta.dtype)
     return Patterns(curves, (curves.T @ theta.reshape(count, -1)).reshape(rank, side, side))
+
+
+def has_clear_patterns(look: InBand) -> bool:
+    """Whether the scene is evidently a sum of a few patterns."""
+    return find_patterns(host(look.solver.theta), beyond_doubt=True) is not None
 
 
 def _above_floor(energy: NDArray[np.float64], noise: float) -> int:

@@ -22,7 +22,7 @@ from acquire.recon.band import segment_operator
 from acquire.recon.bandwidth import FASTEST_SHARE, FEWEST_COEFFICIENTS, MARGIN
 from acquire.recon.basis import LearnedBasis, TemporalBasis, reachable, resized
 from acquire.recon.cosines import begin_in_cosines
-from acquire.recon.patterns import find_patterns
+from acquire.recon.patterns import has_clear_patterns
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -84,7 +84,7 @@ def pursue(
         sure = lamps[light >= max(LAMP, FAINT * light.max(initial=0))]
         if told is None and len(sure):
             told = _beyond(fastest_lamp(), sure.max(), fastest)
-        if made == LOOKS - 1 or (len(sure) and look.is_clear):
+        if made == LOOKS - 1 or (len(sure) and has_clear_patterns(look.estimate)):
             break
         energy = residual_energy(look.estimate.predict())
         usual = np.median(np.delete(energy, look.kept))
@@ -122,11 +122,6 @@ class _Look:
         basis = _basis(kept, given.video_shape[0], given.problem.arrays)
         start = None if still is None else resized(still, basis)
         return cls(given, begin_in_cosines(given, basis, start), kept)
-
-    @property
-    def is_clear(self) -> bool:
-        """Whether the scene is evidently a sum of a few patterns."""
-        return find_patterns(host(self.estimate.solver.theta), beyond_doubt=True) is not None
 
     def moved(self, wanted: NDArray[np.int64]) -> _Look:
         """The same light in other cosines, as far as these hold it."""
