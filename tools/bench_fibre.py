@@ -108,9 +108,8 @@ def measure(options: argparse.Namespace, home: Path) -> None:
     out = home / f"{options.what}-{options.seed}-{time.time_ns()}-video.zarr"
     began = time.monotonic()
     with open_pool(tasks, options.workers, None, watcher) as pool:
-        outcome = combine(
-            opened, request, out, Options(options.preset, shared=options.search == "shared"), pool, watcher
-        )
+        how = Options(options.preset, shared=options.search == "shared")
+        outcome = combine(opened, request, out, options=how, pool=pool, watcher=watcher)
     seconds = time.monotonic() - began
     video, side = open_video(out), request.grid.side
     found = np.asarray(video.video[:])

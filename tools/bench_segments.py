@@ -30,9 +30,8 @@ def measure(path: Path, lines: int, iterations: int, answer: multiprocessing.que
     tasks = len(request.stretches)
     watcher, began = Watcher(tasks), time.perf_counter()
     with open_pool(tasks, watch=watcher) as pool:
-        combine(
-            recording, request, path.with_name(f"{lines}.zarr"), Options(iterations=iterations), pool, watcher
-        )
+        options, out = Options(iterations=iterations), path.with_name(f"{lines}.zarr")
+        combine(recording, request, out, options=options, pool=pool, watcher=watcher)
     seconds = time.perf_counter() - began
     peaks = [
         resource.getrusage(who).ru_maxrss / 1024 for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)

@@ -375,7 +375,9 @@ def _make(
         ):
             watcher = Watcher(tasks, advance, stopped.is_set)
             with open_pool(tasks, workers, arguments.dask, watcher) as pool:
-                outcome = combine(recording, request, place, options, pool, watcher, began)
+                outcome = combine(
+                    recording, request, place, options=options, pool=pool, watcher=watcher, began=began
+                )
         outcomes.append(outcome)
         # Ctrl-C is meant for the whole command.
         if outcome.interrupted:

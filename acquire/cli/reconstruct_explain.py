@@ -23,7 +23,7 @@ def explain_calibration(
 
     The parts are tried on lines in the middle of the selected range.
     """
-    from acquire.reconstruct.explain import MOST_LINES, explain
+    from acquire.reconstruct.explain import TRIAL_LINES, explain
     from acquire.reconstruct.liveliest import representative_tile
     from acquire.reconstruct.select import by_lines
 
@@ -36,7 +36,7 @@ def explain_calibration(
     voxels = arguments.kinds[0]
     first, lines = requested_lines(recording, arguments)
     stream = by_lines(recording, recording.first_available_line if first is None else first, lines).stream
-    count = min(stream.end_line - stream.first_line, MOST_LINES)
+    count = min(stream.end_line - stream.first_line, TRIAL_LINES)
     middle = ((stream.first_line + stream.end_line - count) // 2, count)
     tile = representative_tile(recording, arguments.tiles, middle, chosen.calibration)
     segment = recording.cut(*middle, tile)

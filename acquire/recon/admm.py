@@ -99,7 +99,7 @@ class Admm:
         self._denoiser = Checked(denoiser) if denoiser else tv
         self._xp, arrays = namespace(samples), basis.arrays
         self._emphasis = arrays.asarray(emphasis)
-        # λ/ρ per frame: the split's prox has λ·TV over ρ/2·‖·‖²
+        # λ/ρ for each frame: the split's prox has λ·TV over ρ/2·‖·‖².
         self._strength = self._emphasis * (parameters.tv_weight / parameters.tv_penalty)
         self._operator = operator
         self.theta = arrays.zeros(theta_shape) if start is None else arrays.asarray(start)
@@ -144,13 +144,13 @@ class Admm:
         self.theta = self._xp.asarray(other.theta, copy=True)
         self.adopt(other)
         self._tv_multiplier = other._tv_multiplier * (old.tv_penalty / new.tv_penalty)
-        # the splits are in units of θ; only multipliers are divided by ρ
+        # The splits are in units of θ; only multipliers are divided by ρ.
         self._sign.resume(other._sign)
         self._sign.rescale(old.sign_penalty / new.sign_penalty)
 
     def adopt(self, other: Admm) -> None:
         """Take over w, which belongs to the lines, from a solver in any basis."""
-        # w is the residual of the lines divided by ρ
+        # w is the residual of the lines divided by ρ.
         self._w = other._w * (other._parameters.penalty / self._parameters.penalty)
         self._lifted = self._operator.adjoint(self._w)
 
@@ -159,7 +159,7 @@ class Admm:
 
         This one stays as it is, except for the denoiser's dual field, which both share.
         """
-        # `step` changes w, BᵀW·w and the multipliers in place; what it replaces can be shared
+        # `step` changes w, BᵀW·w and the multipliers in place; what it replaces can be shared.
         other = copy(self)
         other._parameters = replace(self._parameters, tv_weight=heavier * self._parameters.tv_weight)
         other._strength = self._strength * heavier
@@ -198,14 +198,14 @@ class Admm:
     def _data_step(self) -> Array:
         p = self._parameters
         rho = p.penalty
-        # the grid's rows are orthonormal, so that both splits together are one ρ/2·‖θ − centre‖²
+        # The grid's rows are orthonormal, so that both splits together are one ρ/2·‖θ − centre‖².
         centre = self.theta - self._tv_multiplier
         centre *= p.tv_penalty
         centre += p.sign_penalty * self._sign.pull()
         centre /= rho
-        # y − W·B·c − (W·B·BᵀW + ρ)·w, with a single product, since `_lifted` is BᵀW·w
+        # This is y − W·B·c − (W·B·BᵀW + ρ)·w with a single product, since `_lifted` is BᵀW·w.
         residual = self._samples - self._operator.forward(centre + self._lifted) - rho * self._w
-        # checked here: a NaN would end `_descend` as a residual of 0 does, without a word
+        # It is checked here: a NaN would end `_descend` as a residual of 0 does, without a word.
         if not self._xp.isfinite(dot(residual, residual)):
             raise NumericsError(
                 "ADMM diverged: its iterates are not finite", hint="check the segment's samples and weights"
@@ -217,9 +217,9 @@ class Admm:
     def _descend(self, residual: Array, rho: float) -> None:
         """Make conjugate-gradient steps on (W·B·BᵀW + ρ)·w; ``residual`` is overwritten."""
         scaled = self._precondition(residual)
-        # a copy: without a preconditioner `scaled` is the residual itself, which changes in place
+        # This is a copy: without a preconditioner `scaled` is the residual itself, which changes in place.
         direction, energy = self._xp.asarray(scaled, copy=True), dot(residual, scaled)
-        # squared, as the energy is
+        # The bound is squared, as the energy is.
         enough = self._parameters.gradient_share**2 * energy
         for _ in range(self._parameters.gradient_steps):
             if not energy > 0:  # zero, or not a number

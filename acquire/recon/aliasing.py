@@ -24,8 +24,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from acquire.lines import Segment
-    from acquire.recon.clock import IterationClock
-    from acquire.recon.problem import Problem
+    from acquire.recon.given import Given
 
 PATTERNS, WEAKEST = 4, 1e-3
 """Largest number of patterns, and the smallest norm of one relative to the strongest."""
@@ -36,29 +35,23 @@ SHARE = 0.5
 DAMPING = 0.1
 """Damping relative to the mean eigenvalue: cosines that the lines hardly see would absorb all that is
 left."""
-WINDOW, OFTEN, STANDS_ALONE = 101, 90, 6.5
+RIVALS, OFTEN, STANDS_ALONE = 101, 90, 6.5
 """Number of neighbouring cosines, the percentile of theirs that is usual, and the ratio to it above which
 light is detected: 35 for a lamp of 20 kHz with a pattern of its own, up to 4.4 where there is none; 3.6 for
 one of 3 % of a textured picture's area, which is missed."""
-MARGIN = 1.25
+CLEAR_OF_BAND = 1.25
 """Start of the search relative to the end of the band: what is just beyond it belongs to its end."""
-SECONDS, SPAN = 2.0, 980
+SEARCH_S, SEARCHED_SPAN = 2.0, 980
 """Processor time for this number of sub-steps; it grows with their cube."""
-LARGEST_SPAN = 2048
+LONGEST_SEARCHED = 2048
 """Largest number of sub-steps: up to here it is about a tenth of a reconstruction's time, at 2900 a third."""
 
 
 def detect_unresolved_light(
-    segment: Segment,
-    problem: Problem,
-    predicted: NDArray[Any],
-    video: NDArray[Any],
-    *,
-    resolved_hz: float,
-    clock: IterationClock,
+    given: Given, predicted: NDArray[Any], video: NDArray[Any], resolved_hz: float
 ) -> tuple[str, ...]:
     """Return a sentence if light of one frequency beyond ``resolved_hz`` stands out of the residual."""
-    found_hz = unresolved_hz(segment, problem, predicted, video, resolved_hz=resolved_hz, clock=clock)
+    found_hz = unresolved_hz(given, predicted, video, resolved_hz)
     if found_hz is None:
         return ()
     return (
@@ -68,36 +61,30 @@ def detect_unresolved_light(
 
 
 def unresolved_hz(
-    segment: Segment,
-    problem: Problem,
-    predicted: NDArray[Any],
-    video: NDArray[Any],
-    *,
-    resolved_hz: float,
-    clock: IterationClock,
+    given: Given, predicted: NDArray[Any], video: NDArray[Any], resolved_hz: float
 ) -> float | None:
     """Return the frequency beyond ``resolved_hz`` that stands out of the residual most, if one does.
 
     ``predicted`` is as `Problem.samples`, ``video`` (frames, n′, n′) in any unit. None is returned also if
     there is no time for the search, or if the segment is long.
     """
-    span = segment.geometry.span
-    if span > LARGEST_SPAN or not clock.affords(SECONDS * (span / SPAN) ** 3):
+    segment, problem, span = given.segment, given.problem, given.segment.geometry.span
+    if span > LONGEST_SEARCHED or not given.clock.affords(SEARCH_S * (span / SEARCHED_SPAN) ** 3):
         return None
     rate_hz = 1e9 / segment.substep_ns
-    # cosine k of the sub-steps is light of k·rate/(2·span)
-    first = int(np.ceil(MARGIN * resolved_hz * 2 * span / rate_hz))
+    # Cosine k of the sub-steps is light of k·rate/(2·span).
+    first = int(np.ceil(CLEAR_OF_BAND * resolved_hz * 2 * span / rate_hz))
     count = int(SHARE * span)
     residual = np.where(problem.usable, problem.samples - predicted, 0)
     patterns = _patterns(video, segment.geometry.size)
-    # without a window of cosines beyond the band there is nothing that light could stand out of
-    if first + WINDOW > count or not patterns or not residual.any():
+    # Without a window of cosines beyond the band there is nothing that light could stand out of.
+    if first + RIVALS > count or not patterns or not residual.any():
         return None
     basis = TemporalBasis(span, count)
-    # a lamp may be in several patterns, each with a curve of its own: the energies add up
+    # A lamp may be in several patterns, each with a curve of its own: the energies add up.
     energy = sum((_energy(segment, each, residual, basis) for each in patterns), np.zeros(count))
     usual = np.maximum(
-        percentile_filter(energy, OFTEN, WINDOW, mode="nearest"), np.percentile(energy[first:], OFTEN)
+        percentile_filter(energy, OFTEN, RIVALS, mode="nearest"), np.percentile(energy[first:], OFTEN)
     )
     highest = first + int(np.argmax((energy / usual)[first:]))
     return highest * rate_hz / (2 * span) if energy[highest] > STANDS_ALONE * usual[highest] else None
@@ -123,17 +110,17 @@ def _patterns(video: NDArray[Any], size: int) -> list[NDArray[np.float32]]:
     curves = np.linalg.svd(coarse.reshape(frames, -1).astype(np.float64), full_matrices=False)[0][
         :, :PATTERNS
     ]
-    # coarse voxels are enough to find the curves; the patterns keep the voxels of the video
+    # Coarse voxels are enough to find the curves; the patterns keep the voxels of the video.
     strongest = list(np.tensordot(curves.T.astype(video.dtype), video, axes=1))
     mean, strips = video.mean(0), []
     for rows in np.array_split(np.arange(side), STRIPS):
         strip = np.zeros_like(mean)
         strip[rows] = mean[rows]
         across = np.zeros_like(mean)
-        # frames are square: the indices of rows are those of columns, too
+        # Frames are square: the indices of rows are those of columns, too.
         across[:, rows] = mean[:, rows]
         strips += [strip, across]
-    # `CurveOperator` takes fine pixels; a voxel is held over its block
+    # `CurveOperator` takes fine pixels; a voxel is held over its block.
     merge = -(-size // side)
     held = [each.repeat(merge, axis=0).repeat(merge, axis=1)[:size, :size] for each in strongest + strips]
     found = [each.astype(np.float32) for each in held]
@@ -149,7 +136,7 @@ def _energy(
     gram = np.asarray(operator.gram(), np.float64)
     right = np.asarray(operator.adjoint(residual.astype(np.float32)), np.float64)[:, 0]
     inverse = np.linalg.inv(gram + DAMPING * np.trace(gram) / len(gram) * np.eye(len(gram)))
-    # of the damped fit to white noise: the diagonal of (G + δ)⁻¹·G·(G + δ)⁻¹·σ²
+    # The variance of the damped fit to white noise is the diagonal of (G + δ)⁻¹·G·(G + δ)⁻¹·σ².
     variance = np.einsum("ij,ji->i", inverse @ gram, inverse) * np.square(residual, dtype=np.float64).mean()
     ratio: NDArray[np.float64] = np.square(inverse @ right) / np.maximum(variance, np.finfo(np.float64).tiny)
     return ratio

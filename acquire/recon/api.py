@@ -21,6 +21,7 @@ from acquire.recon.denoisers import open_denoiser
 from acquire.recon.description_check import DescriptionCheck, check_description
 from acquire.recon.error_estimation import RESERVED_ITERATIONS, estimate_error
 from acquire.recon.feasibility import check_budget, least_seconds
+from acquire.recon.given import Given
 from acquire.recon.judge import frame_error, judge
 from acquire.recon.options import SolveOptions, Stop, check_hooks, check_table
 from acquire.recon.problem import build_problem
@@ -36,7 +37,6 @@ if TYPE_CHECKING:
     from acquire.recon.denoisers import Denoiser
     from acquire.recon.error import VideoError
     from acquire.recon.estimates import Estimate
-    from acquire.recon.problem import Problem
     from acquire.recon.reuse import Choice
 
 HOLD_OUT = 0.08
@@ -107,7 +107,7 @@ def reconstruct(
         usable sample
     NumericsError : a dark code, or iterates that are not finite
     """
-    # a budget covers the whole call
+    # A budget covers the whole call.
     began = time.monotonic()
     if not isinstance(segment, Segment):
         raise UsageError(
@@ -139,24 +139,25 @@ def reconstruct(
     clock = IterationClock(count, budget_s, progress, stop, began)
     segment, balance_warnings, balance_facts = _balanced(segment)
     held_out = HOLD_OUT if chosen.holds_out and static_image is None else 0.0
-    # BLAS's threads busy-wait for a core that others use; the arms are computed side by side instead
+    # BLAS's threads busy-wait for a core that others use; the arms are computed side by side instead.
     threads = 1 if granted_threads() == 1 else idle_cores()
     with limit_threads(threads), limit_blas(1):
-        # the probe times the compiled loops, which tell nothing about other arrays
+        # The probe times the compiled loops, which tell nothing about other arrays.
         if budget_s is not None and refuse and arrays.compiled:
             least_s = least_seconds(segment.geometry, spatial_merge, temporal_merge, solver)
             check_budget(clock, budget_s, least_s)
-        # after the check, because posing the problem (the operator's norm) takes time itself
+        # It comes after the check, because posing the problem (the operator's norm) takes time itself.
         problem = build_problem(segment, spatial_merge, temporal_merge, hold_out=held_out, arrays=arrays)
-        run = _Run(segment, problem, options, chosen, clock)
-        # before the solver runs, which would otherwise use the whole budget
+        given = Given(segment, problem, options, clock)
+        run = _Run(given, chosen)
+        # The time is reserved before the solver runs, which would otherwise use the whole budget.
         if error and chosen.goes_on and static_image is None:
             clock.reserve(RESERVED_ITERATIONS)
         if look is not None:
             clock.on_look = lambda view: look(replace(view, video=lambda: run.in_scene_units(view.video())))
         estimate: Estimate
         if static_image is not None:
-            estimate = KnownImage(segment, problem, options, np.asarray(static_image), clock)
+            estimate = KnownImage(given, np.asarray(static_image))
         else:
             estimate = chosen.solve(segment, problem, options, clock)
         # A requested number of iterations cuts a solver short, as a budget does; with that of a preset,
@@ -184,43 +185,38 @@ def _balanced(segment: Segment) -> tuple[Segment, tuple[str, ...], dict[str, Any
 class _Run:
     """A posed problem with its solver; turns an estimate into a result."""
 
-    segment: Segment
-    problem: Problem
-    options: SolveOptions
+    given: Given
     solver: Solver
-    clock: IterationClock
 
     def in_scene_units(self, video: NDArray[Any]) -> NDArray[Any]:
         """A dimensionless video in scene units, clipped at 0 unless the solver may find negative light."""
-        video = video * self.problem.scale
+        video = video * self.given.problem.scale
         return video if self.solver.signed else np.maximum(video, 0, out=video)
 
     def result(self, estimate: Estimate, *, check: bool, error: bool, cut: bool) -> Reconstruction:
         """The video with its quality, its estimated error and warnings."""
-        segment, problem, clock, T_m = self.segment, self.problem, self.clock, self.options.temporal_merge
+        segment, problem, clock = self.given.segment, self.given.problem, self.given.clock
+        options, T_m = self.given.options, self.given.options.temporal_merge
         predicted = estimate.predict()
         video = self.in_scene_units(estimate.video())
         held_out = estimate.held_out_error
         prediction = problem.prediction_error(predicted) if held_out is None else held_out
-        noise = problem.noise(segment)
-        quality = Quality(problem.misfit(predicted), prediction, problem.coverage, noise)
+        quality = Quality(problem.misfit(predicted), prediction, problem.coverage, self.given.noise)
         trusted = segment.geometry.trusted_frames(T_m)
-        # whoever stops a run wants the answer now
-        check = check and self.options.static_image is None and clock.ended != "stopped"
+        # Whoever stops a run wants the answer now.
+        check = check and options.static_image is None and clock.ended != "stopped"
         checked = check_description(segment, quality, clock) if check else DescriptionCheck()
         facts = estimate.facts()
         one_hz = cosine_hz(segment.substep_ns * T_m, len(video))
-        # solvers without a band are free in every frame
+        # Solvers without a band are free in every frame.
         whole = [(0, facts.get("temporal_coefficients", len(video)))]
         bands_hz = [(a * one_hz, b * one_hz) for a, b in facts.pop("bands", whole)]
         resolved_hz = bands_hz[-1][1]
         unresolved: tuple[str, ...] = ()
         if check and checked.believed:
-            unresolved = detect_unresolved_light(
-                segment, problem, predicted, video, resolved_hz=resolved_hz, clock=clock
-            )
+            unresolved = detect_unresolved_light(self.given, predicted, video, resolved_hz)
         video_error: VideoError | str = "it was not requested"
-        # the lines that an error would be estimated from show neither of the first two
+        # The lines that an error would be estimated from show neither of the first two.
         if error and not checked.believed:
             video_error = "the lines contradict their description"
         elif error and unresolved:
@@ -228,10 +224,7 @@ class _Run:
         elif error and clock.ended == "stopped":
             video_error = "the reconstruction was stopped"
         elif error:
-            merges = (self.options.spatial_merge, T_m)
-            video_error = estimate_error(
-                segment, problem, estimate, clock, video=video, quality=quality, merges=merges, cut=cut
-            )
+            video_error = estimate_error(self.given, estimate, video=video, quality=quality, cut=cut)
         warnings = judge(segment, problem, quality, trusted)
         if period_frames := facts.get("period_frames"):
             warnings = (*warnings, describe_cycle(period_frames, segment.substep_ns * T_m))
@@ -244,7 +237,7 @@ class _Run:
             processor_s=clock.processor_s,
             iterations=clock.made,
             iterations_asked=clock.iterations,
-            solver=self.options.solver,
+            solver=options.solver,
             quality=quality,
             frame_error=frame_error(problem, predicted, segment.geometry, T_m),
             error=video_error,
@@ -253,7 +246,7 @@ class _Run:
             masked=problem.masked_by,
             warnings=(*warnings, *checked.warnings, *unresolved, *name_gaps(bands_hz), *clock.shortcuts),
             parameters={
-                "spatial_merge": self.options.spatial_merge,
+                "spatial_merge": options.spatial_merge,
                 "temporal_merge": T_m,
                 "dtype": problem.arrays.dtype,
                 **self.solver.model_dump(mode="json"),

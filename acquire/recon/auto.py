@@ -21,10 +21,10 @@ if TYPE_CHECKING:
     from acquire.lines import Segment
 
 TEMPORAL_MERGES = (64, 16, 4, 1)
-ITERATIONS = 40
+TEMPO_ITERATIONS = 40
 BETTER = 1.25
 """Factor by which shorter frames must explain the lines better to be chosen: they cost accuracy elsewhere."""
-EXPLAINED = 0.015
+GOOD_ENOUGH = 0.015
 """Relative error below which nothing shorter is tried."""
 
 
@@ -59,37 +59,37 @@ def tempo(
             progress(len(tried) / most)
 
     geometry = segment.geometry
-    # S fine pixels are one pixel of the camera
+    # S fine pixels are one pixel of the camera.
     side = min(side or geometry.substeps, geometry.size)
     still = _error(segment, Voxels(1, geometry.span))
     tried = [(0, still)]
     done()
     best, chosen = still, Voxels(1, geometry.span)
     for merge in TEMPORAL_MERGES:
-        if best <= EXPLAINED:
+        if best <= GOOD_ENOUGH:
             break
         error = _error(segment, Voxels(side, merge))
         tried.append((merge, error))
         done()
         if error * BETTER <= best:
             best, chosen = error, Voxels(side, merge)
-        # light that is faster than the long frames makes those no better than a still: until one beats the
-        # still, shorter ones may
+        # Light that is faster than the long frames makes those no better than a still: until one beats the
+        # still, shorter ones may.
         elif chosen.temporal_merge < geometry.span:
             break
     return Tempo(chosen, tuple(tried))
 
 
 def _error(segment: Segment, voxels: Voxels) -> float:
-    # only the prediction counts: an estimate of the video's error would take up to 30 more iterations
+    # Only the prediction counts: an estimate of the video's error would take up to 30 more iterations.
     quality = reconstruct(
         segment,
         voxels.spatial_merge,
         voxels.temporal_merge,
         "fast",
-        iterations=ITERATIONS,
+        iterations=TEMPO_ITERATIONS,
         check=False,
         error=False,
     ).quality
-    # very few lines have no held-out samples
+    # Very few lines have no held-out samples.
     return quality.misfit if np.isnan(quality.prediction) else quality.prediction

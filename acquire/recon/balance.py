@@ -84,17 +84,17 @@ def balance_of(segments: Sequence[Segment]) -> Balance | None:
     share is added to the error.
     """
     seen = [each for each in map(_light, segments) if each is not None]
-    # a wrong black level would add up line by line, as light does
+    # A wrong black level would add up line by line, as light does.
     if not seen or any(black_level_off(segment) for segment in segments):
         return None
     known = [np.stack([np.cumsum(light.lines[0]), light.lines[0]], axis=1) for light in seen]
-    # without its mean, each range needs no constant c of its own
+    # Without its mean, each range needs no constant c of its own.
     columns = np.concatenate([each - each.mean(0) for each in known])
     target = np.concatenate([(each := np.cumsum(light.lines[1])) - each.mean() for light in seen])
     scale = np.abs(columns).max(0)
     if not scale.min() > 0:
         return None
-    # cumulated light is many times that of one line; alike in size, the columns are well conditioned
+    # Cumulated light is many times that of one line; alike in size, the columns are well conditioned.
     normal = columns / scale
     inverse = np.linalg.pinv(normal.T @ normal)
     found = inverse @ normal.T @ target
@@ -125,7 +125,7 @@ class _Light:
 def _light(segment: Segment) -> _Light | None:
     geometry = segment.geometry
     samples, usable = segment.samples(np.float64), segment.mask
-    # a spike would remain in the cumulated light of all later lines
+    # A spike would remain in the cumulated light of all later lines.
     for bad in outliers(samples, segment.mask).values():
         usable = usable & ~bad
     masked = 1 - float(usable.mean(axis=(1, 2)).min())
@@ -139,12 +139,12 @@ def _light(segment: Segment) -> _Light | None:
             continue
         count = good.sum(0)
         seen = np.flatnonzero(count)
-        # a column that is masked throughout takes the mean of its neighbours
+        # A column that is masked throughout takes the mean of its neighbours.
         means = np.interp(columns, seen, np.where(good, lines, 0).sum(0)[seen] / count[seen])
         arms.append(np.where(good, lines, means))
     slopes = [0.0, 0.0]
     if segment.alignment is None:
-        # the steepest mean difference between the outermost columns at either end of an arm
+        # This is the steepest mean difference between the outermost columns at either end of an arm.
         for k, arm in enumerate(arms):
             profile = arm.mean(0)
             width = max(1, round(EDGE * len(profile)))
@@ -162,7 +162,7 @@ def divided(segment: Segment, balance: Balance) -> Segment:
     ratio = balance.ratio
     shares = np.array([2 / (1 + ratio), 2 * ratio / (1 + ratio)])
     known = np.asarray(segment.responsivity_dn, np.float64)
-    # per column (arm, column), or one number for each arm
+    # The responsivity is given for each column (arm, column), or as one number for each arm.
     if known.ndim == 2:
         return replace(segment, responsivity_dn=known * shares[:, None], balanced=True)
     a, b = (known * shares).tolist()

@@ -55,15 +55,16 @@ def band_operator(
     basis: Basis,
     spatial_merge: int = 1,
     temporal_merge: int = 1,
+    *,
     alignment: Alignment | None = None,
     blur: Blur | None = None,
 ) -> BandOperator | InBasis:
     """B = Λ′·Dᵀ, by dense factors if these take at most 1 GiB, otherwise by synthesising the video."""
     side = geometry.video_shape(spatial_merge, temporal_merge)[1]
     itemsize = np.dtype(basis.arrays.dtype).itemsize
-    if 2 * geometry.lines * side * basis.count * itemsize <= LARGEST_FACTORS_BYTES:
-        return BandOperator(geometry, code, basis, spatial_merge, temporal_merge, alignment, blur)
-    return InBasis(geometry, code, basis, spatial_merge, temporal_merge, alignment, blur)
+    dense = 2 * geometry.lines * side * basis.count * itemsize <= LARGEST_FACTORS_BYTES
+    make = BandOperator if dense else InBasis
+    return make(geometry, code, basis, spatial_merge, temporal_merge, alignment=alignment, blur=blur)
 
 
 def segment_operator(
@@ -81,8 +82,8 @@ def segment_operator(
         basis,
         spatial_merge,
         temporal_merge,
-        segment.alignment,
-        segment.blur,
+        alignment=segment.alignment,
+        blur=segment.blur,
     )
 
 
@@ -96,6 +97,7 @@ class BandOperator:
         basis: Basis,
         spatial_merge: int = 1,
         temporal_merge: int = 1,
+        *,
         alignment: Alignment | None = None,
         blur: Blur | None = None,
     ) -> None:
@@ -108,14 +110,14 @@ class BandOperator:
         self._registration = registration(alignment, geometry, spatial_merge, basis.arrays)
         starts, lengths = block_bounds(geometry.size, spatial_merge)
         lit = lit_cosines(code, basis, temporal_merge)
-        # arm B's rows are the scene's columns from right to left: the factor has them in that order, so that
-        # the view of the frames need not be reversed
+        # Arm B's rows are the scene's columns from right to left: the factor has them in that order, so that
+        # the view of the frames need not be reversed.
         flipped = geometry.size - starts - lengths
         factors = [staircase(lit, order, lengths, geometry) for order in (starts, flipped)]
         mergings: list[NDArray[Any]] = [merging, merging]
         self._veils: list[Veil | None] = [None, None]
         if blur is not None:
-            # along the transfer the blur goes into the factor, across it into the merging: it costs no time
+            # Along the transfer the blur goes into the factor, across it into the merging: it costs no time
             # per frame. The matrices are those of the scene's rows and columns; arm B's charge moves along
             # the latter.
             (along_a, across_a), (across_b, along_b) = blur_matrices(blur, geometry.size, spatial_merge)
@@ -178,9 +180,10 @@ class BandOperator:
     @cached_property
     def _grams(self) -> list[NDArray[np.float64]]:
         """B·Bᵀ of each arm, between lines (L_R, L_R)."""
-        # the merging adds only a factor per pixel, whose mean is taken: all are equal if N_m divides S
+        # The merging adds only a factor per pixel, whose mean is taken: all are equal if N_m divides S.
         each = [np.square(host(m), dtype=np.float64).sum(axis=0).mean() for m in self._mergings]
-        # float64, because neighbouring lines are nearly equal, and the inverse multiplies rounding errors
+        # It is computed in float64, because neighbouring lines are nearly equal, and the inverse multiplies
+        # rounding errors.
         exact = [host(factor).astype(np.float64) for factor in self._factors]
         return [float(size) * (factor @ factor.T) for size, factor in zip(each, exact, strict=True)]
 
@@ -245,6 +248,7 @@ class InBasis:
         basis: Basis,
         spatial_merge: int = 1,
         temporal_merge: int = 1,
+        *,
         alignment: Alignment | None = None,
         blur: Blur | None = None,
     ) -> None:
@@ -252,9 +256,9 @@ class InBasis:
         arrays = basis.arrays
         self._operator: DualArm | GatheredArms
         if arrays.compiled:
-            self._operator = DualArm(*case, np.dtype(arrays.dtype).type, alignment, blur)
+            self._operator = DualArm(*case, np.dtype(arrays.dtype).type, alignment=alignment, blur=blur)
         else:
-            self._operator = GatheredArms(*case, arrays, alignment, blur)
+            self._operator = GatheredArms(*case, arrays, alignment=alignment, blur=blur)
 
     def forward(self, theta: Array) -> Array:
         return self._operator.forward(self._basis.synthesize(theta))
@@ -277,15 +281,15 @@ def staircase(
     S, K = geometry.substeps, lit.shape[1]
     first = np.arange(geometry.lines)[:, None] * S
     factor = np.empty((geometry.lines, len(starts), K), lit.dtype)
-    # the last block may be shorter, and has other multiplicities then
+    # The last block may be shorter, and has other multiplicities then.
     for length in np.unique(lengths):
         steps = length + S - 1
         # The sum depends on line and block only through the sub-step where it begins, and there are about n′
         # times fewer of those: they are summed once, and then copied.
         sums = np.zeros((len(lit) - steps + 1, K), lit.dtype)
         for d in range(steps):
-            # number of rows r of the block and steps u of the line with r + u = d; in lit's dtype, because
-            # one of numpy's int64 would make the products float64
+            # This is the number of rows r of the block and steps u of the line with r + u = d. It has lit's
+            # dtype, because one of numpy's int64 would make the products float64.
             multiplicity = lit.dtype.type(min(d + 1, length, S, length + S - 1 - d))
             sums += multiplicity * lit[d : d + len(sums)]
         blocks = np.flatnonzero(lengths == length)

@@ -23,7 +23,7 @@ from acquire.arrays import host
 from acquire.recon.admm import Admm, AdmmParameters
 from acquire.recon.band import segment_operator
 from acquire.recon.basis import TemporalBasis, reachable
-from acquire.recon.lamps import last_lamp, search_seconds
+from acquire.recon.lamps import WINDOW, last_lamp, search_seconds
 from acquire.recon.problem import build_problem
 
 if TYPE_CHECKING:
@@ -40,14 +40,14 @@ COARSE_SIDE = 24
 HELD_BY = 3
 """Largest number of stages across a coarse voxel for which the floor is low enough without a search for lamps
 (M = 72) in a slow scene: there it took a bullet and a runner for lamps."""
-ITERATIONS, FEWEST_ITERATIONS = 12, 10
+TENTATIVE_ITERATIONS, FEWEST_TENTATIVE = 12, 10
 PEAK = 25.0
 """Largest ratio of the floor's highest coefficient to its median: 5 to 15 for a floor, more for light."""
 MARGIN = 1.25
 FEWEST_COEFFICIENTS = 32
-WINDOW, STANDS_OUT = 61, 9.0
-"""Number of neighbouring cosines whose median is the floor, and the ratio to it above which light is
-detected; residuals without light reach 5 to 8."""
+STANDS_OUT = 9.0
+"""Ratio to the median of the neighbouring cosines (`WINDOW`) above which light is detected; residuals without
+light reach 5 to 8."""
 LARGEST_SHARE, FASTEST_SHARE = 0.25, 0.5
 """Share of the sub-steps' cosines that a band may have, and in which single lamps are looked for."""
 
@@ -67,17 +67,17 @@ def estimate_coefficients(
     spatial_merge, temporal_merge = merges
     frames = segment.geometry.video_shape(spatial_merge, temporal_merge)[0]
     most = reachable(frames, temporal_merge, LARGEST_SHARE)
-    # the answer would be the same whatever the lines show
+    # The answer would be the same whatever the lines show.
     if most <= FEWEST_COEFFICIENTS:
         return min(frames, FEWEST_COEFFICIENTS)
     merge = _coarse(segment.geometry, spatial_merge)
-    # whatever the dtype of the video: only the end of the signal is wanted
+    # The dtype of the video does not matter: only the end of the signal is wanted.
     arrays = replace(problem.arrays, dtype="float32")
     theta = _tentative(segment, (merge, temporal_merge), most, hurry, arrays)
     energy = np.square(theta, dtype=np.float64).sum((1, 2))
     floor = energy[len(energy) // 2 :]
     above = np.flatnonzero(energy > floor.max())
-    # it may be no floor, the more so if nothing is above it; in doubt the band is wide
+    # It may be no floor, the more so if nothing is above it; in doubt the band is wide.
     doubtful = floor.max() > PEAK * np.median(floor) or not len(above)
     last = len(energy) if doubtful else int(above[-1]) + 1
     slow = MARGIN * last <= FEWEST_COEFFICIENTS
@@ -88,7 +88,7 @@ def estimate_coefficients(
 
 def is_large(geometry: Geometry, spatial_merge: int) -> bool:
     """Whether coarse voxels cover so many pixels that their errors may hide a fast lamp."""
-    # a criterion that needs no truth: the size of the coarse voxels relative to those they stand for
+    # This criterion needs no truth: it is the size of the coarse voxels relative to those they stand for.
     return _coarse(geometry, spatial_merge) > max(spatial_merge, HELD_BY * geometry.substeps)
 
 
@@ -117,7 +117,7 @@ def light_beyond(
     """
     merge = -(-segment.geometry.size // COARSE_SIDE)
     frames = segment.geometry.video_shape(merge, temporal_merge)[0]
-    # too few cosines beyond the band to have a floor of their own
+    # There would be too few cosines beyond the band to have a floor of their own.
     looked_at = reachable(frames, temporal_merge, FASTEST_SHARE)
     if looked_at <= count + WINDOW:
         return None
@@ -144,13 +144,13 @@ def _tentative(
     merge, temporal_merge = merges
     frames, side, _ = segment.geometry.video_shape(merge, temporal_merge)
     basis = TemporalBasis(frames, count, arrays)
-    # all samples: nothing is judged by prediction here
+    # All samples are used: nothing is judged by prediction here.
     problem = build_problem(segment, merge, temporal_merge, hold_out=0.0, arrays=arrays)
     operator = problem.masked(segment_operator(segment, basis, merge, temporal_merge))
     parameters = AdmmParameters(grid_per_coefficient=1)
     solver = Admm(operator, problem.used_samples, (count, side, side), basis, parameters)
-    for made in range(ITERATIONS):
-        if made >= FEWEST_ITERATIONS and hurry():
+    for made in range(TENTATIVE_ITERATIONS):
+        if made >= FEWEST_TENTATIVE and hurry():
             break
         solver.step()
     return host(solver.theta)

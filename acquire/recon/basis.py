@@ -96,7 +96,7 @@ class TemporalBasis:
             )
         k = np.arange(self.count)[:, None]
         rows = np.sqrt(2 / points) * np.cos(np.pi * k * (np.arange(points) + 0.5) / points)
-        # the constant's mean square is 1, the other cosines' ½
+        # The constant's mean square is 1, the other cosines' ½.
         rows[0] /= np.sqrt(2)
         matrix: NDArray[Any] = rows.astype(self.arrays.dtype)
         return matrix
@@ -110,7 +110,7 @@ class TemporalBasis:
         if not self.arrays.compiled:
             return _product(self.arrays, self.matrix().T, theta)
         # `n` pads the coefficients with zeros up to the number of frames; for 64 × 64 × 980, two workers took
-        # 8 ms and a product with the matrix 35
+        # 8 ms and a product with the matrix 35.
         return self.arrays.asarray(idct(theta, n=self.frames, axis=0, norm="ortho", workers=2))
 
     def analyze(self, video: Array) -> Array:
@@ -165,7 +165,7 @@ class CyclicBasis:
         self.frames, self.harmonics, self.arrays = frames, harmonics, arrays
         self.period_frames = period_frames
         self.count = 2 * harmonics + 1
-        # cosine k of the span is k/2 cycles in it
+        # Cosine k of the span is k/2 cycles in it.
         self.cosines = min(frames, math.ceil(2 * harmonics * frames / period_frames) + 1)
         self.held = np.arange(self.cosines)
         oblique = self._oblique(frames)
@@ -210,7 +210,7 @@ def _product(arrays: Arrays, matrix: NDArray[Any], frames: Array) -> Array:
 
 def resized(theta: Array, basis: Basis) -> Array:
     """Coefficients cut or zero-padded to the number of cosines of ``basis``."""
-    # the first cosines are the same whatever their number, so that coefficients keep their meaning
+    # The first cosines are the same whatever their number, so that coefficients keep their meaning.
     xp, kept = basis.arrays.xp, theta[: min(basis.count, theta.shape[0]), ...]
     missing = basis.arrays.zeros((basis.count - kept.shape[0], *theta.shape[1:]))
     return xp.concat([kept, missing])

@@ -10,7 +10,6 @@ which are finer. Which is which shows in the fast cosines of the first look, whi
 
 from __future__ import annotations
 
-from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -21,7 +20,7 @@ from acquire.recon.band import segment_operator
 from acquire.recon.bandwidth import FEWEST_COEFFICIENTS
 from acquire.recon.basis import TemporalBasis
 from acquire.recon.joined import JoinedOperator, JoinedPrior, JoinedSign, Layout
-from acquire.recon.patterns import GAP, Patterns, Refinement
+from acquire.recon.patterns import GAP, PARAMETERS, Patterns, Refinement
 from acquire.recon.sign import SignSplit
 from acquire.recon.tv import FrameTv
 from acquire.recon.volume import VolumeTv
@@ -30,8 +29,10 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from acquire.arrays import Array
+    from acquire.recon.admm import AdmmParameters
     from acquire.recon.basis import Basis, LearnedBasis
-    from acquire.recon.problem import MaskedOperator, Operator
+    from acquire.recon.given import Given
+    from acquire.recon.problem import Operator
 
 MOST_LAMPS, MOST_SLOW = 8, 3
 """Largest number of fast patterns, and of slow ones besides the ground."""
@@ -76,65 +77,58 @@ def _principal(rows: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[
     return images, strength
 
 
-class BesideMotion(Refinement):
-    """A refinement of patterns and, in the same solver, of a volume; ``found.motion`` is its start."""
+class PatternsAndMotion:
+    """The unknowns of patterns and of a volume, ``motion`` (K, n′, n′) at first: θ is both in one array."""
 
-    share = WEIGHT
-    loosens = False
+    share, loosens = WEIGHT, False
 
-    def _solver(self, operator: MaskedOperator, basis: LearnedBasis, emphasis: NDArray[Any]) -> Admm:
-        arrays, start = self._problem.arrays, self._theta
-        parts = self._layout.parts(start)
-        volume = SignSplit(Admm.grid_of(self._slow, self.parameters), parts[0], None)
-        patterns = SignSplit(Admm.grid_of(basis, self.parameters), parts[1], None)
-        denoisers = VolumeTv(PACE), FrameTv(self.parameters.tv_iterations, joint=True)
-        weights = VOLUME_WEIGHT, arrays.asarray(emphasis)
-        return Admm(
-            operator,
-            self._problem.used_samples,
-            self._layout.shape,
-            basis,
-            self.parameters,
-            start=start,
-            denoiser=JoinedPrior(self._layout, denoisers, weights),
-            sign=JoinedSign(self._layout, volume, patterns),
-        )
-
-    @property
-    def _slow(self) -> TemporalBasis:
+    def __init__(self, given: Given, cosines: TemporalBasis, motion: Array) -> None:
+        self._given = given
+        self._slow = TemporalBasis(cosines.frames, motion.shape[0], given.problem.arrays)
         """The basis of the volume."""
-        motion = self.found.motion
-        assert motion is not None
-        return TemporalBasis(self._cosines.frames, motion.shape[0], self._problem.arrays)
+        self._volume_operator = segment_operator(given.segment, self._slow, *given.merges)
 
-    @property
-    def _layout(self) -> Layout:
-        found = self.found
+    def stacked(self, found: Patterns) -> Array:
+        asarray = self._given.problem.arrays.asarray  # what a refinement begins with is on the host
+        return self._layout(found).joined(asarray(found.motion), asarray(found.patterns))
+
+    def unstacked(self, theta: Array, found: Patterns) -> Patterns:
+        motion, patterns = self._layout(found).parts(theta)
+        return Patterns(found.curves, patterns, motion)
+
+    def operator(self, patterns: Operator, found: Patterns) -> Operator:
+        return JoinedOperator(self._layout(found), self._volume_operator, patterns)
+
+    def priors(
+        self, found: Patterns, basis: LearnedBasis, parameters: AdmmParameters, /, *, emphasis: Array
+    ) -> dict[str, Any]:
+        layout = self._layout(found)
+        parts = layout.parts(self.stacked(found))
+        volume = SignSplit(Admm.grid_of(self._slow, parameters), parts[0], None)
+        patterns = SignSplit(Admm.grid_of(basis, parameters), parts[1], None)
+        denoisers = VolumeTv(PACE), FrameTv(parameters.tv_iterations, joint=True)
+        weights = VOLUME_WEIGHT, self._given.problem.arrays.asarray(emphasis)
+        return {
+            "denoiser": JoinedPrior(layout, denoisers, weights),
+            "sign": JoinedSign(layout, volume, patterns),
+        }
+
+    def other_lines(self, found: Patterns) -> Array:
+        return self._volume_operator.forward(found.motion)
+
+    def other_video(self, found: Patterns) -> NDArray[Any]:
+        return host(self._slow.synthesize(found.motion))
+
+    def _layout(self, found: Patterns) -> Layout:
         assert found.motion is not None
-        # a voxel's penalty is that of its pixels
-        return Layout(tuple(found.motion.shape), tuple(found.patterns.shape), float(self._spatial_merge))
+        # A voxel's penalty is that of its pixels.
+        scale = float(self._given.options.spatial_merge)
+        return Layout(tuple(found.motion.shape), tuple(found.patterns.shape), scale)
 
-    @cached_property
-    def _volume_operator(self) -> Operator:
-        return segment_operator(self.segment, self._slow, self._spatial_merge, self._temporal_merge)
 
-    def _operators(self) -> tuple[MaskedOperator, LearnedBasis]:
-        _, basis = super()._operators()
-        self._operator = JoinedOperator(self._layout, self._volume_operator, self._operator)
-        return self._problem.masked(self._operator), basis
-
-    @property
-    def _theta(self) -> Array:
-        asarray = self._problem.arrays.asarray  # what a refinement begins with is on the host
-        return self._layout.joined(asarray(self.found.motion), asarray(self.found.patterns))
-
-    def _at(self, curves: NDArray[Any]) -> Patterns:
-        motion, patterns = self._layout.parts(self._admm.theta)
-        return Patterns(curves, patterns, motion)
-
-    def _known_lines(self) -> NDArray[Any]:
-        return host(self._volume_operator.forward(self.found.motion)) / self._problem.norm
-
-    def video(self) -> NDArray[Any]:
-        video: NDArray[Any] = super().video() + host(self._slow.synthesize(self.found.motion))
-        return video
+def beside_motion(
+    given: Given, cosines: TemporalBasis, found: Patterns, parameters: AdmmParameters = PARAMETERS
+) -> Refinement:
+    """A refinement of patterns and, in the same solver, of a volume; ``found.motion`` is its start."""
+    assert found.motion is not None
+    return Refinement(given, cosines, found, parameters, PatternsAndMotion(given, cosines, found.motion))

@@ -25,7 +25,7 @@ from acquire.recon.bandwidth import (
     light_beyond,
 )
 from acquire.recon.basis import TemporalBasis, cosine_hz, reachable, resized
-from acquire.recon.beside_motion import BesideMotion, find_lamps
+from acquire.recon.beside_motion import beside_motion, find_lamps
 from acquire.recon.cosines import (
     FEW_FRAMES,
     LAMPS_SHARE,
@@ -35,26 +35,24 @@ from acquire.recon.cosines import (
     find_band,
 )
 from acquire.recon.estimates import InBand, Refined
-from acquire.recon.patterns import PARAMETERS, ROUND, Refinement, find_patterns
+from acquire.recon.patterns import PARAMETERS, ROUND, Refinement, find_patterns, has_clear_patterns
 from acquire.recon.pursuit import pursue, widened
-from acquire.recon.settling import CLEARLY, better_than, early_error, has_time, settle
+from acquire.recon.settling import BETTER_BESIDE_MOTION, better_than, early_error, has_time, settle
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
 
     from acquire.arrays import Array
-    from acquire.lines import Segment
-    from acquire.recon.clock import IterationClock
     from acquire.recon.estimates import Estimate
-    from acquire.recon.options import SolveOptions
+    from acquire.recon.given import Given
     from acquire.recon.patterns import Patterns
-    from acquire.recon.problem import Problem
 
 GLANCE, FIRST_LOOK, LONGER_LOOK = 20, 60, 90
 """Number of iterations in the cosines before they are compared with other priors (and before it is decided
 whether few frames explain the lines), and before patterns are looked for; the last if patterns are in
 doubt."""
-# a longer look at 146 cosines (Fig. 9, one code) left 10 s no time to drop four superfluous patterns: 7 dB
+# A longer look at 146 cosines (Fig. 9, one code) left 10 s no time to drop four superfluous patterns, which
+# cost 7 dB.
 FIRST_LOOK_SHARE, LONGER_SHARE = 0.7, 0.4
 """Upper limit on the first look's share of the budget, and the share after which it is not made longer."""
 BEYOND_S = 2e-6
@@ -68,7 +66,7 @@ SOON_EXPLAINED = 1.5
 """Held-out error of patterns after their first rounds, relative to the noise, up to which nothing moves."""
 PLAIN_ITERATIONS = 90
 """Number of iterations for scenes without patterns: more of them fit what voxels cannot represent."""
-EXPLAINED = 0.1
+AT_REST = 0.1
 """Relative prediction error below which they do, and below which cosines start from a still."""
 FREER = 0.85
 """Largest error of cosines that are no patterns, relative to that of a still, a volume or fewer cosines, for
@@ -79,114 +77,85 @@ NOISE_SHARE = 0.7
 """Share of noise in the first look's prediction error, for cameras whose noise is unknown."""
 
 
-def solve_in_cosines(
-    segment: Segment, problem: Problem, options: SolveOptions, clock: IterationClock
-) -> Estimate:
+def solve_in_cosines(given: Given) -> Estimate:
     """Solve in cosines, then as patterns and curves if the scene consists of a few."""
-    first = first_look(segment, problem, options, clock)
-    return refine(segment, problem, options, clock, first)
+    return refine(given, first_look(given))
 
 
-def first_look(
-    segment: Segment,
-    problem: Problem,
-    options: SolveOptions,
-    clock: IterationClock,
-    still: Array | None = None,
-) -> InBand:
+def first_look(given: Given, still: Array | None = None) -> InBand:
     """A first look in the requested or estimated band, from the coefficients (1, n′, n′) of a still."""
-    count = find_band(segment, problem, options, clock)
-    first = _solve_glance(segment, problem, options, clock, count=count, still=still)
-    complete_look(first, options, clock)
+    first = _solve_glance(given, find_band(given), still)
+    complete_look(given, first)
     return first
 
 
-def glance(
-    segment: Segment,
-    problem: Problem,
-    options: SolveOptions,
-    clock: IterationClock,
-    still: Array | None = None,
-) -> InBand:
+def glance(given: Given, still: Array | None = None) -> InBand:
     """The first iterations of a first look, after which it can be compared with other priors."""
-    lamps = _look_for_lamps(segment, problem, options, clock, still)
+    lamps = _look_for_lamps(given, still)
     if lamps is not None:
         return lamps
-    clock.reset()  # the limit holds for each stage
-    count = find_band(segment, problem, options, clock)
-    return _solve_glance(segment, problem, options, clock, count=count, still=still)
+    given.clock.reset()  # the limit holds for each stage
+    return _solve_glance(given, find_band(given), still)
 
 
-def _look_for_lamps(
-    segment: Segment, problem: Problem, options: SolveOptions, clock: IterationClock, still: Array | None
-) -> InBand | None:
+def _look_for_lamps(given: Given, still: Array | None) -> InBand | None:
     """A first look in the slow cosines and those of lamps; None if there is no lamp, or no time."""
+    clock, (spatial_merge, temporal_merge) = given.clock, given.merges
     if clock.spent(UNSEARCHED_SHARE):
         return None
-    merges = (options.spatial_merge, options.temporal_merge)
 
     def iterations(look: InBand, most: int) -> Iterator[int]:
-        most = min(most, _at_most(FIRST_LOOK, options) - clock.done)
+        most = min(most, _at_most(FIRST_LOOK, given) - clock.done)
         return clock.run(most, "first look", FIRST_LOOK_SHARE, look.video)
 
     def search() -> int:
-        if not is_large(segment.geometry, options.spatial_merge):
+        if not is_large(given.segment.geometry, spatial_merge):
             return 0
         hurry, affords = partial(clock.spent, TENTATIVE_SHARE), partial(clock.affords, share=LAMPS_SHARE)
-        return fastest_lamp(segment, problem, options.temporal_merge, hurry, affords)
+        return fastest_lamp(given.segment, given.problem, temporal_merge, hurry, affords)
 
-    begin = partial(begin_in_cosines, segment, problem, options)
-    return pursue(segment, problem, merges, begin, iterations, search, still)
+    return pursue(given, iterations, search, still)
 
 
-def refine(
-    segment: Segment, problem: Problem, options: SolveOptions, clock: IterationClock, first: InBand
-) -> Estimate:
+def refine(given: Given, first: InBand) -> Estimate:
     """Refine a first look, and solve again in a wider band if the lines show light beyond this one."""
-    found = _refine_once(segment, problem, options, clock, first)
-    if not clock.affords(BEYOND_S * segment.geometry.lines * first.basis.frames):
+    segment, problem = given.segment, given.problem
+    found = _refine_once(given, first)
+    if not given.clock.affords(BEYOND_S * segment.geometry.lines * first.basis.frames):
         return found
-    seen = light_beyond(segment, problem, found.predict(), options.temporal_merge, first.basis.cosines)
+    seen = light_beyond(segment, problem, found.predict(), given.options.temporal_merge, first.basis.cosines)
     if seen is not None:
-        alone = isinstance(found, Refined)
-        first, found = _followed(segment, problem, options, clock, first, found, seen, alone=alone)
-    hidden = _hidden_lamp(segment, problem, options, clock, first, found)
+        first, found = _followed(given, first, found, seen, alone=isinstance(found, Refined))
+    hidden = _hidden_lamp(given, first, found)
     if hidden is not None:
-        _, found = _followed(segment, problem, options, clock, first, found, hidden, alone=True)
+        _, found = _followed(given, first, found, hidden, alone=True)
     return found
 
 
 def _followed(
-    segment: Segment,
-    problem: Problem,
-    options: SolveOptions,
-    clock: IterationClock,
-    first: InBand,
-    found: Estimate,
-    cosine: int,
-    *,
-    alone: bool,
+    given: Given, first: InBand, found: Estimate, cosine: int, *, alone: bool
 ) -> tuple[InBand, Estimate]:
     """A look that holds a cosine beyond the band, ``alone`` or with all that are slower, and its result.
 
     The ``first`` look and what was ``found`` in it are returned if the other predicts no better.
     """
-    lamp_hz = cosine * cosine_hz(segment.substep_ns * options.temporal_merge, first.basis.frames)
+    clock, options = given.clock, given.options
+    lamp_hz = cosine * cosine_hz(given.segment.substep_ns * options.temporal_merge, first.basis.frames)
     faster = f"the lines contain light of about {lamp_hz:.3g} Hz, faster than the band of the video"
     if options.bandwidth is not None or clock.spent(WIDER_SHARE):
         clock.shortcuts.append(f"{faster}: a longer budget or a higher bandwidth shows it")
         return first, found
     clock.reset()
     if alone:
-        look = widened(first, cosine, partial(begin_in_cosines, segment, problem, options))
+        look = widened(given, first, cosine)
     else:
-        # the constant cosine is a still, of which the wider band is to find the change
+        # The constant cosine is a still, of which the wider band is to find the change.
         still, count = first.solver.theta[:1, ...], round(MARGIN * (cosine + 1))
-        look = _solve_glance(segment, problem, options, clock, count=count, still=still)
-    complete_look(look, options, clock)
-    wider = _refine_once(segment, problem, options, clock, look)
-    before, after = (problem.prediction_error(each.predict()) for each in (found, wider))
-    # the noise that many cosines admit hardly shows in the lines, and patterns admit little of it
+        look = _solve_glance(given, count, still)
+    complete_look(given, look)
+    wider = _refine_once(given, look)
+    before, after = (given.problem.prediction_error(each.predict()) for each in (found, wider))
+    # The noise that many cosines admit hardly shows in the lines, and patterns admit little of it.
     if after < (1 if isinstance(wider, Refined) else FREER) * before:
         return look, wider
     if after < before:
@@ -194,165 +163,142 @@ def _followed(
     return first, found
 
 
-def _hidden_lamp(
-    segment: Segment,
-    problem: Problem,
-    options: SolveOptions,
-    clock: IterationClock,
-    first: InBand,
-    found: Estimate,
-) -> int | None:
+def _hidden_lamp(given: Given, first: InBand, found: Estimate) -> int | None:
     """The cosine of a lamp that the band mimics, if more is left of the lines than their noise."""
-    predicted, noise = found.predict(), problem.noise(segment)
+    predicted, noise, temporal_merge = found.predict(), given.noise, given.options.temporal_merge
     left = EXPLAINED_BY_NOISE * noise if noise < np.inf else LEAST_MISSED  # NaN if it is unknown
-    if options.bandwidth is not None or clock.spent(WIDER_SHARE):
+    if given.options.bandwidth is not None or given.clock.spent(WIDER_SHARE):
         return None  # nothing would be solved again: `detect_unresolved_light` reports it at the end
-    if not problem.prediction_error(predicted) > left:
+    if not given.problem.prediction_error(predicted) > left:
         return None
-    frame_ns = segment.substep_ns * options.temporal_merge
+    frame_ns = given.segment.substep_ns * temporal_merge
     resolved_hz = first.basis.cosines * cosine_hz(frame_ns, first.basis.frames)
-    found_hz = unresolved_hz(segment, problem, predicted, found.video(), resolved_hz=resolved_hz, clock=clock)
+    found_hz = unresolved_hz(given, predicted, found.video(), resolved_hz)
     if found_hz is None:
         return None
     cosine = round(found_hz / cosine_hz(frame_ns, first.basis.frames))
-    # frames may be too slow for it
-    most = reachable(first.basis.frames, options.temporal_merge, FASTEST_SHARE)
+    # Frames may be too slow for it.
+    most = reachable(first.basis.frames, temporal_merge, FASTEST_SHARE)
     return cosine if cosine < most else None
 
 
-def _refine_once(
-    segment: Segment, problem: Problem, options: SolveOptions, clock: IterationClock, first: InBand
-) -> Estimate:
+def _refine_once(given: Given, first: InBand) -> Estimate:
     """Patterns and curves, or more iterations in the cosines if the scene does not consist of a few."""
-    refined = None if options.denoiser else _in_patterns(segment, problem, options, first, clock)
+    refined = None if given.options.denoiser else _in_patterns(given, first)
     if refined is not None:
         return refined
-    for _ in clock.run(PLAIN_ITERATIONS - clock.done, "solve", video=first.video):
+    for _ in given.clock.run(PLAIN_ITERATIONS - given.clock.done, "solve", video=first.video):
         first.solver.step()
     return first
 
 
-def _solve_glance(
-    segment: Segment,
-    problem: Problem,
-    options: SolveOptions,
-    clock: IterationClock,
-    *,
-    count: int,
-    still: Array | None,
-) -> InBand:
+def _solve_glance(given: Given, count: int, still: Array | None) -> InBand:
     """Solve in ``count`` cosines; few frames get lower penalties if they turn out to explain the lines.
 
     From zero, the smallest video that explains the lines contains the code, since they carry no information
     about sub-steps without light, and total variation ignores flat light. From a still, the solver finds the
     smallest change that explains them.
     """
-    frames = segment.geometry.video_shape(options.spatial_merge, options.temporal_merge)[0]
+    problem, frames = given.problem, given.video_shape[0]
     basis = TemporalBasis(frames, min(frames, count), problem.arrays)
-    begin = partial(begin_in_cosines, segment, problem, options, basis)
     start = None if still is None else resized(still, basis)
-    if options.initial is not None:
-        # in the solvers' units, as `_Run.in_scene_units` undoes at the end
-        start = basis.analyze(problem.arrays.asarray(options.initial / problem.scale))
-    estimate = begin(start)
-    for _ in clock.run(_at_most(GLANCE, options), "first look", FIRST_LOOK_SHARE, estimate.video):
+    if given.options.initial is not None:
+        # The start is in the solvers' units, as `_Run.in_scene_units` undoes at the end.
+        start = basis.analyze(problem.arrays.asarray(given.options.initial / problem.scale))
+    estimate = begin_in_cosines(given, basis, start)
+    for _ in given.clock.run(_at_most(GLANCE, given), "first look", FIRST_LOOK_SHARE, estimate.video):
         estimate.solver.step()
     few = 1 < frames <= FEW_FRAMES
-    if few and problem.prediction_error(estimate.predict()) < EXPLAINED:
-        # freed of the high penalties, few frames at rest reached 36 dB instead of 21
-        estimate = begin(estimate.solver.theta, explained=True)
+    if few and problem.prediction_error(estimate.predict()) < AT_REST:
+        # Freed of the high penalties, few frames at rest reached 36 dB instead of 21.
+        estimate = begin_in_cosines(given, basis, estimate.solver.theta, explained=True)
     return estimate
 
 
-def complete_look(first: InBand, options: SolveOptions, clock: IterationClock) -> None:
+def complete_look(given: Given, first: InBand) -> None:
     """Continue a first look until it shows whether the scene is a sum of a few patterns."""
+    clock = given.clock
     for look in (FIRST_LOOK, LONGER_LOOK):
-        rest = _at_most(look, options) - clock.done
+        rest = _at_most(look, given) - clock.done
         for _ in clock.run(rest, "first look", FIRST_LOOK_SHARE, first.video):
             first.solver.step()
-        if find_patterns(host(first.solver.theta), beyond_doubt=True) or clock.spent(LONGER_SHARE):
+        if has_clear_patterns(first) or clock.spent(LONGER_SHARE):
             break
 
 
-def _at_most(look: int, options: SolveOptions) -> int:
+def _at_most(look: int, given: Given) -> int:
     """Number of iterations of a first look, which leaves some for what follows it."""
-    return min(look, -(-4 * options.iterations // 5))
+    return min(look, -(-4 * given.options.iterations // 5))
 
 
-def _in_patterns(
-    segment: Segment,
-    problem: Problem,
-    options: SolveOptions,
-    first: InBand,
-    clock: IterationClock,
-) -> Estimate | None:
+def _in_patterns(given: Given, first: InBand) -> Estimate | None:
     """Patterns and curves from a first look; None if the scene does not consist of a few.
 
     If it is in doubt whether it does, or if they predict worse than the look, something may move beside them.
     """
-    # curves are fitted at the end of a round: less than one gains nothing
+    segment, problem, clock = given.segment, given.problem, given.clock
+    # Curves are fitted at the end of a round: less than a round gains nothing.
     if clock.done >= clock.iterations or not clock.affords(ROUND * clock.longest_s):
         return None
     theta = host(first.solver.theta)
     basis = TemporalBasis(first.basis.frames, first.basis.cosines, problem.arrays)
-    merges, parameters = (options.spatial_merge, options.temporal_merge), _for_noise(segment, problem, first)
+    parameters = _for_noise(given, first)
 
-    def begin(kind: type[Refinement], found: Patterns) -> Refinement:
+    def begin(kind: Callable[..., Refinement], found: Patterns) -> Refinement:
         curves = host(first.basis.spread(problem.arrays.asarray(found.curves)))
-        return kind(segment, problem, basis, replace(found, curves=curves), merges, parameters)
+        return kind(given, basis, replace(found, curves=curves), parameters)
 
     alone = find_patterns(theta)
     usual = None if alone is None else partial(begin, Refinement, alone)
     rivals: list[Callable[[], Refinement]] = []
-    # each refinement of a large segment holds a video's worth of memory
-    if not is_large(segment.geometry, options.spatial_merge):
-        rivals = [partial(begin, BesideMotion, each) for each in find_lamps(theta, first.basis)]
-    error, noise = problem.prediction_error(first.predict()), problem.noise(segment)
+    # Each refinement of a large segment holds a video's worth of memory.
+    if not is_large(segment.geometry, given.options.spatial_merge):
+        rivals = [partial(begin, beside_motion, each) for each in find_lamps(theta, first.basis)]
+    error, noise = problem.prediction_error(first.predict()), given.noise
     explained = max(SOON_EXPLAINED * noise, LEAST_MISSED) if noise < np.inf else LEAST_MISSED  # NaN: unknown
     clock.reset()  # the limit holds for each stage: the first look takes longer where patterns are in doubt
     refinement = None
-    if rivals and find_patterns(theta, beyond_doubt=True) is None and has_time(clock):
-        refinement = _beside_motion(usual, rivals, min(error, explained), problem, clock)
+    if rivals and not has_clear_patterns(first) and has_time(clock):
+        refinement = _beside_motion(given, usual, rivals, min(error, explained))
         rivals = []
     if refinement is None and usual is not None:
         refinement = usual()
     if refinement is not None:
-        refinement = settle(refinement, problem, clock)
+        refinement = settle(given, refinement)
         left = problem.prediction_error(refinement.predict())
         if rivals and left > min(error, explained) and has_time(clock):
-            other = better_than(left, rivals, problem, clock)
+            other = better_than(given, left, rivals)
             if other is not None:
-                other = settle(other, problem, clock)
+                other = settle(given, other)
                 refinement = other if problem.prediction_error(other.predict()) < left else refinement
-    # without held-out samples both are NaN
+    # Without held-out samples both are NaN.
     if refinement is None or error < problem.prediction_error(refinement.predict()):
         return None
     return Refined(refinement, basis.count)
 
 
 def _beside_motion(
+    given: Given,
     usual: Callable[[], Refinement] | None,
     rivals: Sequence[Callable[[], Refinement]],
     enough: float,
-    problem: Problem,
-    clock: IterationClock,
 ) -> Refinement | None:
     """Patterns beside something that moves, unless the ``usual`` ones soon predict to ``enough``."""
-    soon = np.inf if usual is None else early_error(usual(), problem, clock)
+    soon = np.inf if usual is None else early_error(given, usual())
     if soon > enough:
-        return better_than(CLEARLY * soon, rivals, problem, clock)
-    clock.reset()
+        return better_than(given, BETTER_BESIDE_MOTION * soon, rivals)
+    given.clock.reset()
     return None
 
 
-def _for_noise(segment: Segment, problem: Problem, first: InBand) -> AdmmParameters:
+def _for_noise(given: Given, first: InBand) -> AdmmParameters:
     """Parameters of the patterns, with a λ that is at first proportional to the noise, if there is some.
 
     Without held-out samples and known noise the NaN leaves the weight as it is.
     """
-    noise = problem.noise(segment)
-    # infinite for lines without light, NaN if it is unknown
+    noise = given.noise
+    # The noise is infinite for lines without light, and NaN if it is unknown.
     if not noise < np.inf:
-        noise = NOISE_SHARE * problem.prediction_error(first.predict())
-    # the constant first: `max` returns it if the other is NaN
+        noise = NOISE_SHARE * given.problem.prediction_error(first.predict())
+    # The constant comes first: `max` returns it if the other is NaN.
     return replace(PARAMETERS, tv_weight=max(PARAMETERS.tv_weight, WEIGHT_PER_NOISE * noise))

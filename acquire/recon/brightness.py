@@ -4,7 +4,7 @@ With V known, a line is linear in g: Y(i, ·) = Σ_t g(t)·E(t)·V's light along
 There are a few hundred unknowns for all samples; if V contains part of the brightness already, g stays near
 1. The lines carry no information about sub-steps without light: with more cosines than g needs, least squares
 would let it run wild between two flashes. Each cosine of g − 1 therefore has an energy γ that it shares with
-its neighbours; γ and the noise σ² are those for which the lines are most likely, as in `curves`.
+its neighbours; γ and the noise σ² are those for which the lines are most likely (`evidence`).
 """
 
 from __future__ import annotations
@@ -14,8 +14,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from scipy.ndimage import uniform_filter1d
 
-from acquire.forward import blurring, column_merging, registration
+from acquire.forward import column_merging
 from acquire.recon.basis import TemporalBasis
+from acquire.recon.evidence import FAINTEST, NormalEquations, determined_share
+from acquire.recon.views import seen_by_arms
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -23,16 +25,11 @@ if TYPE_CHECKING:
     from acquire.lines import Segment
     from acquire.recon.problem import Problem
 
-RIDGE = 1e-3
+START_RIDGE = 1e-3
 """Ridge of the start relative to the mean eigenvalue: it draws g to 1 where no line has information on it."""
-EVIDENCE_STEPS = 12
+MOST_STEPS = 12
 NEIGHBOURS = 9
 """Number of neighbouring cosines that share their energy: the light of one lamp is rarely in a single one."""
-FAINTEST = 1e-10
-"""Smallest energy, noise and precision relative to the largest energy, the lines' and the mean eigenvalue:
-smaller ones would never come back, or leave the equations singular."""
-LEAST_DETERMINED = 0.01
-"""Smallest share of an unknown that counts as determined by the lines; it bounds a step of its energy."""
 DIMMEST = 0.02
 """Smallest brightness relative to the mean; dimmer instants would not be seen at all."""
 
@@ -57,7 +54,7 @@ def fit_brightness(
     lit = (basis[:, frame] * segment.code).T.astype(np.float32)
     merging = column_merging(geometry, spatial_merge).astype(np.float32)
     normal, right, energy, samples = np.zeros((cosines, cosines)), np.zeros(cosines), 0.0, 0
-    # arm B's rows are the scene's columns from right to left
+    # Arm B's rows are the scene's columns from right to left.
     blocks = (np.arange(n) // spatial_merge, np.arange(n)[::-1] // spatial_merge)
     for arm, (view, row) in enumerate(zip(_views(segment, video, spatial_merge), blocks, strict=True)):
         pixels = view @ merging
@@ -65,54 +62,44 @@ def fit_brightness(
             used = problem.weight[arm, line] > 0
             seen = np.zeros((len(used), cosines), np.float32)
             for u in range(S):
-                # step u of a line exposes row r in sub-step line·S + u + r
+                # Step u of a line exposes row r in sub-step line·S + u + r.
                 instants = line * S + u + np.arange(n)
                 seen += pixels[frame[instants], row].T @ lit[instants]
-            # summed over all lines in float64, since the normal matrix is inverted
+            # The sums over all lines are in float64, since the normal matrix is inverted.
             rows = seen[used].astype(np.float64)
             normal += rows.T @ rows
-            # pixels are Λ′ itself applied to the video, without the norm that samples are divided by
+            # Pixels are Λ′ itself applied to the video, without the norm that samples are divided by.
             lines = problem.samples[arm, line][used].astype(np.float64) * problem.norm
             right += rows.T @ lines
             energy, samples = energy + float(lines @ lines), samples + len(lines)
     if not normal.any():
         return np.ones(frames)  # a dark video explains nothing, however bright
-    # g = 1, to which the prior draws: solved for is g − 1
+    # The prior draws to g = 1, so that g − 1 is solved for.
     flat = basis @ np.ones(frames)
-    left = energy - 2 * float(flat @ right) + float(flat @ normal @ flat)
-    change = _most_likely(normal, right - normal @ flat, left, samples)
+    left = NormalEquations(normal, right, energy, samples).left(flat)
+    change = _most_likely(NormalEquations(normal, right - normal @ flat, left, samples))
     brightness = np.maximum(basis.T @ (flat + change), DIMMEST)
     return np.asarray(brightness / brightness.mean())
 
 
 def _views(segment: Segment, video: NDArray[Any], spatial_merge: int) -> tuple[NDArray[Any], NDArray[Any]]:
     """Return the video as each arm's sensor has it (time, block along the charge, block across)."""
-    alignment, blur, geometry = segment.alignment, segment.blur, segment.geometry
-    # a picture that does not change is one frame, repeated without being copied
+    # A picture that does not change is one frame, repeated without being copied.
     frames = video[:1] if video.strides[0] == 0 else video
-    view_a = view_b = np.ascontiguousarray(frames, np.float32)
-    if (moved := registration(alignment, geometry, spatial_merge)) is not None:
-        view_b = moved.forward(view_b)
-    if (blurred := blurring(blur, geometry, spatial_merge)) is not None:
-        view_a, view_b = blurred.forward(0, view_a), blurred.forward(1, view_b)
-    a, b = (np.broadcast_to(view, video.shape) for view in (view_a, view_b))
+    views = seen_by_arms(segment, np.ascontiguousarray(frames, np.float32), spatial_merge)
+    a, b = (np.broadcast_to(view, video.shape) for view in views)
     return a, b.transpose(0, 2, 1)
 
 
-def _most_likely(
-    normal: NDArray[np.float64], right: NDArray[np.float64], energy: float, samples: int
-) -> NDArray[np.float64]:
-    """The solution x (K,) of normal·x = right with the prior for which the lines are most likely.
-
-    ``energy`` is the sum of the squares of the ``samples``. The lines determine a share of each unknown; its
-    energy is its square over that share (MacKay, Neural Comput. 4, 415 (1992)).
-    """
+def _most_likely(equations: NormalEquations) -> NDArray[np.float64]:
+    """Solve for x (K,) with the prior for which the lines are most likely (`evidence`)."""
+    normal, right = equations.normal, equations.right
     diagonal = np.diag_indices_from(normal)
     damped, mean_eigenvalue = normal.copy(), np.trace(normal) / len(normal)
-    damped[diagonal] += RIDGE * mean_eigenvalue
+    damped[diagonal] += START_RIDGE * mean_eigenvalue
     x: NDArray[np.float64] = np.asarray(np.linalg.solve(damped, right), np.float64)
-    share, noise = np.full(len(x), np.square(x).mean()), energy / samples
-    for _ in range(EVIDENCE_STEPS):
+    share, noise = np.full(len(x), np.square(x).mean()), equations.energy / equations.samples
+    for _ in range(MOST_STEPS):
         if share.max() < FAINTEST**2 or not noise > 0:
             break  # g is 1, or explains the lines exactly
         precision = noise / np.maximum(share, FAINTEST * share.max())
@@ -121,8 +108,7 @@ def _most_likely(
         damped[diagonal] += precision
         inverse = np.linalg.inv(damped)
         x = np.asarray(inverse @ right, np.float64)
-        determined = np.clip(1 - precision * np.diag(inverse), LEAST_DETERMINED, 1)
+        determined = determined_share(precision, inverse)
         share = uniform_filter1d(np.square(x) / determined, NEIGHBOURS, mode="nearest")
-        left = energy - 2 * float(x @ right) + float(x @ normal @ x)
-        noise = max(left, FAINTEST * energy) / max(samples - float(determined.sum()), 1.0)
+        noise = equations.noise(x, determined)
     return x

@@ -31,7 +31,7 @@ LEAST_PACE, LARGEST_PACE = 0.25, 64.0
 LEAST_WEIGHT, LARGEST_WEIGHT = 1e-7, 1e3
 WEIGHT_STEP, PACE_STEP = 10**0.5, 4.0
 USUAL_FRAMES, USUAL_ENERGY = 980, 7.1e-3
-"""Number of frames and response to a voxel in Fig. 9, for which the candidates' weights are given."""
+"""Number of frames and response to a voxel in Fig. 9, for which weights are given."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -125,8 +125,8 @@ def parameters(candidate: Candidate, frames: int, response: float) -> AdmmParame
     """
     w, extent = candidate.weight, (frames / USUAL_FRAMES) ** 0.5
     if candidate.prior == "still":
-        # all sub-steps add up in one frame, whose mean light outweighs a detail thousands of times: only
-        # small penalties and data steps run to their end recover the details
+        # All sub-steps add up in one frame, whose mean light outweighs a detail thousands of times: only
+        # small penalties and data steps run to their end recover the details.
         weight, penalty, steps = w * extent, 0.1 * w, STILL_STEPS
     elif candidate.prior == "smooth":
         weight, penalty, steps = w, 2e-3, 2

@@ -22,7 +22,7 @@ import numpy as np
 
 from acquire.arrays import host
 from acquire.recon.blinking import (
-    EXPLAINED,
+    AT_REST,
     FIRST_LOOK_SHARE,
     FREER,
     GLANCE,
@@ -35,12 +35,13 @@ from acquire.recon.blinking import (
 from acquire.recon.candidates import CALM, SMOOTH, STILL, VOLUME
 from acquire.recon.cycle import find_period
 from acquire.recon.estimates import Preferred, Refined
+from acquire.recon.given import Given
 from acquire.recon.holdout import HeldOut
-from acquire.recon.patterns import find_patterns
+from acquire.recon.patterns import find_patterns, has_clear_patterns
 from acquire.recon.reuse import reuse_choice
 from acquire.recon.solver import Preset, Solver
 from acquire.recon.still import best_still, change_bench, weighted_like
-from acquire.recon.workbench import BRIGHTER, FIRST_ITERATIONS, LEAST_GAIN, SEARCH_SHARE, Workbench
+from acquire.recon.workbench import BRIGHTER, FIRST_ITERATIONS, GAIN_OF_WEAKER, SEARCH_SHARE, Workbench
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -62,14 +63,14 @@ FAR = 1.25
 SMOOTHER = 0.85
 """Largest error of a smooth volume, relative to the volume's, for which it is preferred: a quadratic prior
 admits more noise that does not show."""
-CLEARLY = 0.97
+MOVING = 0.97
 """Largest error of a volume, relative to a still's, for which it is preferred; the change from a still equals
 the still where its prior is strong, and need only be better."""
 REPEATS = 0.8
 """Largest error of a cycle, relative to the volume's, the still's and the cosines' at a glance, for which it
 is a candidate: a video that repeats itself claims more than any other. Motion that repeats has 0.4 to 0.7,
 text that scrolls 0.9."""
-CLOSE, DOUBTFUL = 1.1, 2.0
+CLOSE, NOT_FAR = 1.1, 2.0
 """Largest error of the cosines, relative to the best trial's, for which they are continued, and for which
 they are if clear patterns were found, or if only a glance was taken."""
 
@@ -89,14 +90,14 @@ class AdmmSolver(Solver):
         If the options give a bandwidth, weight, denoiser or start, the cosines are solved for without a
         choice.
         """
-        held_out = HeldOut(problem, segment.geometry)
+        given, held_out = Given(segment, problem, options, clock), HeldOut(problem, segment.geometry)
         fixed = (options.denoiser, options.tv_weight, options.bandwidth, options.initial)
         if not held_out or any(each is not None for each in fixed):
-            return solve_in_cosines(segment, problem, options, clock)
-        bench = Workbench(segment, problem, options, clock, held_out)
+            return solve_in_cosines(given)
+        bench = Workbench(given, held_out)
         trials = max(4, options.iterations // ITERATIONS_PER_TRIAL)
         if options.choice is not None:
-            reused = reuse_choice(bench, segment, options, trials)
+            reused = reuse_choice(bench, trials)
             if reused is not None:
                 return reused
         if bench.frames == 1:
@@ -106,31 +107,29 @@ class AdmmSolver(Solver):
         if clock.spent(SEARCH_SHARE):
             clock.shortcuts.append("the budget left no time to try more than one kind of motion")
             return bench.finish(volume)
-        return _choose(bench, segment, options, volume, trials)
+        return _choose(bench, volume, trials)
 
 
-def _choose(
-    bench: Workbench, segment: Segment, options: SolveOptions, volume: Trial, trials: int
-) -> Estimate:
+def _choose(bench: Workbench, volume: Trial, trials: int) -> Estimate:
     """Compare a first volume with a still, the cosines and the other priors, and solve with the best.
 
     Scenes that blink need most of a budget for the cosines, and others need it for the search: a glance
     decides which comes first. Many cosines take ten times as long as a trial of the others.
     """
-    problem, clock = bench.problem, bench.clock
+    given, clock = bench.given, bench.clock
     plain = bench.attempt(bench.fitting(STILL), FIRST_ITERATIONS)
-    at_rest = plain.error < EXPLAINED and not bench.held_out.clearly_less(volume.errors, plain.errors)
-    cosines = glance(segment, problem, options, clock, plain.coefficients if at_rest else None)
-    # taken now, because the trials below forget how long the cosines' iterations are
+    at_rest = plain.error < AT_REST and not bench.held_out.clearly_less(volume.errors, plain.errors)
+    cosines = glance(given, plain.coefficients if at_rest else None)
+    # The time is taken now, because the trials below forget how long the cosines' iterations are.
     rest_s = (LONGER_LOOK - GLANCE) * clock.longest_s
     errors = bench.record_errors({"prior": "cosines"} | cosines.facts(), cosines.predict())
-    at_a_glance, clear = bench.held_out.relative(errors), _has_clear_patterns(cosines)
+    at_a_glance, clear = bench.held_out.relative(errors), has_clear_patterns(cosines)
     tried = _Tried(volume, plain)
-    # even where cosines are ahead: a scene that flickers gains 6.6 to 15 dB by this, a flame up to 3.5;
-    # evident lamps need the time for themselves
+    # These are tried even where cosines are ahead: a scene that flickers gains 6.6 to 15 dB by this, a flame
+    # up to 3.5. Evident lamps need the time for themselves.
     if not clear:
         tried.smooth = bench.probe(bench.fitting(SMOOTH), min(at_a_glance, tried.best.error))
-        # the first cosine is constant, so that this is the video's mean over time
+        # The first cosine is constant, so that this is the video's mean over time.
         picture = (cosines.basis.matrix()[0, 0] * host(cosines.solver.theta[0, ...])).clip(0)
         tried.bright = bench.brighten(picture, cosines.basis.cosines, min(at_a_glance, tried.best.error))
         period = find_period(cosines.solver.theta, cosines.basis)
@@ -140,17 +139,17 @@ def _choose(
             tried.cycle = cycle if cycle.error < REPEATS * rival else None
     ahead, refined = at_a_glance <= OUTDONE * tried.best.error, None
     if ahead:
-        complete_look(cosines, options, clock)
+        complete_look(given, cosines)
         if find_patterns(host(cosines.solver.theta)) is not None:
-            refined = refine(segment, problem, options, clock, cosines)
+            refined = refine(given, cosines)
             if (clear or isinstance(refined, Refined)) and _wins(bench, refined, tried.best):
                 return Preferred(refined, bench.record)
     best = _search(bench, tried, trials, bench.error(cosines.predict()) if ahead else np.inf)
-    near = at_a_glance < DOUBTFUL * best.error and clock.affords(rest_s, FIRST_LOOK_SHARE)
+    near = at_a_glance < NOT_FAR * best.error and clock.affords(rest_s, FIRST_LOOK_SHARE)
     if not ahead and near:
-        complete_look(cosines, options, clock)
+        complete_look(given, cosines)
     if refined is None and (ahead or near) and _worth_refining(bench, cosines, best):
-        refined = refine(segment, problem, options, clock, cosines)
+        refined = refine(given, cosines)
     if refined is not None and _wins(bench, refined, best):
         return Preferred(refined, bench.record)
     return bench.finish(best)
@@ -196,15 +195,15 @@ def _search(bench: Workbench, tried: _Tried, trials: int, rival: float) -> Trial
     smooth = tried.smooth or bench.attempt(bench.fitting(SMOOTH), FIRST_ITERATIONS)
     volume = min((each for each in (tried.volume, calm, tried.cycle) if each is not None), key=_error)
     bright = tried.bright
-    # to a brightness, a flash in front of a still is the flash of everything
+    # To a brightness, a flash in front of a still is the flash of everything.
     flickers = bright is not None and bench.held_out.clearly_less(bright.errors, plain.errors)
     if bright is not None and flickers and bright.error < BRIGHTER * volume.error:
         volume = bright
     if plain.error < FAR * volume.error:
-        explains = plain.error < EXPLAINED
-        merge = bench.options.spatial_merge
+        explains = plain.error < AT_REST
+        merge = bench.given.options.spatial_merge
         still = best_still(plain, trials, merge=merge) if explains else bench.climb(plain, trials)
-    # where much moves, the still was not searched further, and is no ground for a change
+    # Where much moves, the still was not searched further, and is no ground for a change.
     if still is not plain:
         candidate = replace(weighted_like(still, bench.fitting(VOLUME)), change=True)
         change = change_bench(bench, still).attempt(candidate, FIRST_ITERATIONS)
@@ -217,13 +216,13 @@ def _search(bench: Workbench, tried: _Tried, trials: int, rival: float) -> Trial
             volume = volume.bench.follow_period(volume)
     if smooth.error < FAR * min(volume.error, rival):
         smooth = bench.climb(smooth, trials)
-    # beyond chance, which is worth 5 dB where something flashes; not required of other volumes, since ten
-    # blocks reject some of these that are 2 dB better
+    # The gain has to be beyond chance, which is worth 5 dB where something flashes. This is not required of
+    # other volumes, since ten blocks reject some of these that are 2 dB better.
     flows = smooth.error < SMOOTHER * volume.error and bench.held_out.clearly_less(
         smooth.errors, still.errors
     )
     moving = smooth if flows else volume
-    most = 1 - LEAST_GAIN if moving.candidate.change else CLEARLY
+    most = 1 - GAIN_OF_WEAKER if moving.candidate.change else MOVING
     return moving if moving.error < most * still.error else still
 
 
@@ -232,12 +231,8 @@ def _worth_refining(bench: Workbench, cosines: InBand, best: Trial) -> bool:
     error = bench.error(cosines.predict())
     if error < CLOSE * best.error:
         return True
-    return error <= DOUBTFUL * best.error and _has_clear_patterns(cosines)
+    return error <= NOT_FAR * best.error and has_clear_patterns(cosines)
 
 
 def _error(trial: Trial) -> float:
     return trial.error
-
-
-def _has_clear_patterns(cosines: InBand) -> bool:
-    return find_patterns(host(cosines.solver.theta), beyond_doubt=True) is not None

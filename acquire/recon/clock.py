@@ -116,7 +116,7 @@ class IterationClock:
             needed_s, after_s = SLOWER * self.longest_s, self.mean_s if made >= least else 0.0
             if repeat:
                 one_s = self.mean_s or expected_s
-                # the second pass, and what the first still lacks of ``repeat``
+                # The second pass has to fit, and what the first still lacks of ``repeat``.
                 passes = max(repeat, made + 1) + max(repeat - made - 1, 0)
                 needed_s = max(needed_s, one_s) + one_s * passes
             if self.stop_requested or not self._fits(needed_s, after_s):
@@ -148,7 +148,7 @@ class IterationClock:
         last = min(self.done + most, self.iterations)
         expected, before = self.longest_s, self._recent_s
         if stage != self._stage:
-            # a stage that continues has measured its iterations; those of a new one are different
+            # A stage that continues has measured its iterations; those of a new one are different.
             expected, self._recent_s = first * expected, deque(maxlen=REMEMBERED)
         while self.done < last and self._may_continue(expected, share):
             begun = self.seconds
@@ -159,7 +159,7 @@ class IterationClock:
             self._stage = stage
             if video is not None:
                 self.show(stage, video)
-        # no iteration of the stage fitted: what is known of others remains
+        # If no iteration of the stage fitted, what is known of others remains.
         if not self._recent_s:
             self._recent_s = before
 
@@ -168,7 +168,7 @@ class IterationClock:
 
         At least one runs. They are not shown: call `show` with the best candidate after a trial.
         """
-        # a trial's iterations take their own time, which tells nothing about those before or after it
+        # A trial's iterations take their own time, which tells nothing about those before or after it.
         self._recent_s, self._stage = deque(maxlen=REMEMBERED), ""
         for tried in range(most):
             if tried and (self._stopped() or not self.affords(self.longest_s, share)):
@@ -188,7 +188,7 @@ class IterationClock:
 
     def spent(self, share: float) -> bool:
         """Whether this share of the budget is used up, or a stop was requested."""
-        # before the first iteration there is no result to stop with
+        # Before the first iteration there is no result to stop with.
         if self.made and self._stopped():
             return True
         return self._budget_s is not None and self.seconds > share * self._budget_s
@@ -209,7 +209,7 @@ class IterationClock:
         self.made += 1
         self._recent_s.append(seconds)
         if self._progress is not None:
-            # trials count as made, and may outnumber the limit: never more than the whole is done
+            # Trials count as made, and may outnumber the limit: never more than the whole is done.
             self._progress(Progress(self.made, max(self.made, self.iterations), self.seconds, stage))
 
     def _fits(self, seconds: float, iteration_s: float, share: float = 1.0) -> bool:
@@ -217,7 +217,8 @@ class IterationClock:
         if self._budget_s is None:
             return True
         finish_s = FINISH_SHARE * self._budget_s + FINISH_ITERATIONS * iteration_s
-        # by the mean: only some iterations, as every fifth of a refinement, are as long as the longest
+        # The mean is used, because only some iterations, as every fifth of a refinement, are as long as the
+        # longest.
         finish_s += min(self._reserved * self.mean_s, RESERVED_SHARE * self._budget_s)
         return self.seconds + seconds <= min(share * self._budget_s, self._budget_s - finish_s)
 
@@ -226,7 +227,7 @@ class IterationClock:
             return False
         if not self.made or self.affords(expected, share):
             return True
-        # a stage that has used up its share ends, but not the run
+        # A stage that has used up its share ends, but not the run.
         if share >= 1:
             self.ended = "budget"
         return False

@@ -34,7 +34,7 @@ class _Stopwatch(event.Listener):
 
 
 _stopwatch = _Stopwatch()
-# at import, before any loop of this package is called: every compilation counts
+# This happens at import, before any loop of this package is called: every compilation counts.
 event.register("numba:compile", _stopwatch)  # type: ignore[no-untyped-call]
 
 

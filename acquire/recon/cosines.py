@@ -10,45 +10,34 @@ from acquire.recon.admm import Admm, AdmmParameters
 from acquire.recon.band import segment_operator
 from acquire.recon.bandwidth import FEWEST_COEFFICIENTS, estimate_coefficients
 from acquire.recon.basis import cosine_hz
+from acquire.recon.candidates import USUAL_FRAMES
 from acquire.recon.estimates import InBand
 
 if TYPE_CHECKING:
     from acquire.arrays import Array
-    from acquire.lines import Segment
     from acquire.recon.basis import Basis
-    from acquire.recon.clock import IterationClock
-    from acquire.recon.options import SolveOptions
-    from acquire.recon.problem import Problem
+    from acquire.recon.given import Given
 
 TENTATIVE_SHARE = 0.15
 """Share of the budget after which the search for the bandwidth hurries."""
 LAMPS_SHARE = 0.3
 """Share of the budget within which the search for the fastest lamp must end; otherwise it is skipped."""
-# 0.2 was a cliff on a busy host, where posing alone may take as much
+# A share of 0.2 was a cliff on a busy host, where posing alone may take as much.
 UNSEARCHED_SHARE = 0.4
 """Share of the budget that posing the problem may take; beyond it, the bandwidth is not searched for."""
-USUAL_FRAMES = 980
 FEW_FRAMES = 32
 HELD_BACK = 100.0
 """Factor of the penalties for few frames unless they explain the lines."""
-STILL = AdmmParameters(tv_weight=5e-6, tv_penalty=1e-5, sign_penalty=3e-6, gradient_steps=6)
+STILL_PARAMETERS = AdmmParameters(tv_weight=5e-6, tv_penalty=1e-5, sign_penalty=3e-6, gradient_steps=6)
 """Parameters for a single frame. All sub-steps add up in it, so that the mean light has an eigenvalue some
 thousand times that of a detail: lower penalties admit details, and more gradient steps reach them."""
 
 
-def begin_in_cosines(
-    segment: Segment,
-    problem: Problem,
-    options: SolveOptions,
-    basis: Basis,
-    start: Array | None,
-    *,
-    explained: bool = False,
-) -> InBand:
+def begin_in_cosines(given: Given, basis: Basis, start: Array | None, *, explained: bool = False) -> InBand:
     """A solver in the coefficients of a basis, from a start."""
-    N_m, T_m = options.spatial_merge, options.temporal_merge
-    frames, side, _ = segment.geometry.video_shape(N_m, T_m)
-    operator = segment_operator(segment, basis, N_m, T_m)
+    problem, options = given.problem, given.options
+    frames, side, _ = given.video_shape
+    operator = segment_operator(given.segment, basis, *given.merges)
     parameters = parameters_for(frames, explained=explained)
     if options.tv_weight is not None:
         parameters = replace(parameters, tv_weight=options.tv_weight)
@@ -64,15 +53,14 @@ def begin_in_cosines(
     return InBand(solver, operator, basis, problem, parameters)
 
 
-def find_band(segment: Segment, problem: Problem, options: SolveOptions, clock: IterationClock) -> int:
+def find_band(given: Given) -> int:
     """Number of cosines: as requested, or as the lines show, or a few if the budget leaves no time."""
-    N_m, T_m = options.spatial_merge, options.temporal_merge
-    frames = segment.geometry.video_shape(N_m, T_m)[0]
-    if options.bandwidth is not None:
-        return min(frames, max(1, round(options.bandwidth * frames)))
+    segment, clock, frames = given.segment, given.clock, given.video_shape[0]
+    if given.options.bandwidth is not None:
+        return min(frames, max(1, round(given.options.bandwidth * frames)))
     if clock.spent(UNSEARCHED_SHARE):
         few = min(frames, FEWEST_COEFFICIENTS)
-        limit_hz = few * cosine_hz(segment.substep_ns * T_m, frames)
+        limit_hz = few * cosine_hz(segment.substep_ns * given.options.temporal_merge, frames)
         clock.shortcuts.append(
             "the budget left no time to search for the scene's bandwidth: the video holds only changes "
             f"slower than {limit_hz:.3g} Hz"
@@ -80,8 +68,8 @@ def find_band(segment: Segment, problem: Problem, options: SolveOptions, clock: 
         return few
     return estimate_coefficients(
         segment,
-        problem,
-        (N_m, T_m),
+        given.problem,
+        given.merges,
         partial(clock.spent, TENTATIVE_SHARE),
         partial(clock.affords, share=LAMPS_SHARE),
     )
@@ -95,7 +83,7 @@ def parameters_for(frames: int, *, explained: bool = False) -> AdmmParameters:
     they do (``explained``), the scene is at rest and is solved as a still is.
     """
     if frames == 1:
-        return STILL
+        return STILL_PARAMETERS
     usual = AdmmParameters()
     threshold = usual.tv_weight / usual.tv_penalty * min(1.0, frames / USUAL_FRAMES) ** 0.5
     penalty = usual.tv_penalty * (HELD_BACK if frames <= FEW_FRAMES and not explained else 1.0)
@@ -104,5 +92,5 @@ def parameters_for(frames: int, *, explained: bool = False) -> AdmmParameters:
         tv_weight=threshold * penalty,
         tv_penalty=penalty,
         sign_penalty=usual.sign_penalty * penalty / usual.tv_penalty,
-        gradient_steps=STILL.gradient_steps if explained else usual.gradient_steps,
+        gradient_steps=STILL_PARAMETERS.gradient_steps if explained else usual.gradient_steps,
     )

@@ -13,7 +13,7 @@ and with its inverse as preconditioner a few steps are enough if some samples ar
 Without a prior, noise and the errors of the patterns go into the cosines that the lines hardly determine: the
 curves of fast lamps lose their amplitude. γ_c, the energy of cosine c, is shared by the patterns, so that it
 means the same however they are rotated; it and the noise σ² are those for which the lines are most likely
-(the evidence, MacKay, Neural Comput. 4, 415 (1992)). On lines without noise the prior fades out.
+(`evidence`). On lines without noise the prior fades out.
 """
 
 from __future__ import annotations
@@ -24,7 +24,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from acquire.arrays import dot, host
-from acquire.forward import blurring, column_merging, registration
+from acquire.forward import column_merging
+from acquire.recon.evidence import FAINTEST, NormalEquations, determined_share
+from acquire.recon.views import seen_by_arms
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -44,10 +46,6 @@ REFRESH = 4
 """Number of calls that share a preconditioner and a prior."""
 EVIDENCE_STEPS = 2
 """Number of fixed-point steps of the prior in such a call; it converges over the calls."""
-FAINTEST = 1e-10
-"""Smallest energy of a cosine relative to the largest: below it, the cosine would never come back."""
-LEAST_DETERMINED = 0.01
-"""Smallest share of an unknown that counts as determined by the lines; it bounds a step of its energy."""
 LARGEST_SPAN = 8192
 """Largest number of sub-steps for which the normal matrix is formed; it would take too much memory beyond."""
 LARGEST_UNKNOWNS = 4096
@@ -119,7 +117,7 @@ class CurveFit:
         def normal(x: Array) -> Array:
             return exact.asarray(operator.adjoint(operator.forward(arrays.asarray(x)))) + damping * x
 
-        # the damping holds back the change, the prior the curves: only the latter pulls at the start
+        # The damping holds back the change, the prior the curves: only the latter pulls at the start.
         right = exact.asarray(gradient - precision * start)
         change = _conjugate_gradients(normal, right, self._precondition, STEPS if small else PLAIN_STEPS)
         fitted: NDArray[np.float64] = start + host(change)
@@ -131,24 +129,24 @@ class CurveFit:
         """Update damping, preconditioner and, if the fit learns, its prior.
 
         ``gram`` is the normal matrix of all samples before their scaling, ``gradient`` (K, R) the adjoint of
-        the residual of ``start``, ``energy`` the sum of its squares. The lines determine a share of each
-        unknown, 1 − σ²/γ·(G + σ²/γ)⁻¹ on the diagonal: a cosine's energy is its mean square over that share,
-        and the noise is the residual's over the samples that no unknown takes up.
+        the residual of ``start``, ``energy`` the sum of its squares. A cosine's energy is the mean over the
+        patterns of its squares, each over the share of it that the lines determine.
         """
         cosines, rank = start.shape
-        samples = np.count_nonzero(self._problem.weight)
-        # as if the masked samples were spread evenly, which is near enough for a preconditioner and a prior
+        samples = int(np.count_nonzero(self._problem.weight))
+        # The masked samples are taken to be spread evenly, which is near enough for a preconditioner and a
+        # prior.
         gram *= samples / self._problem.weight.size / self._problem.norm**2
         self._damping = max(self._ridge * float(np.trace(gram)) / len(gram), float(np.finfo(np.float32).tiny))
-        # in the order of `gram`: all cosines of a pattern, then those of the next
+        # These are in the order of `gram`: all cosines of a pattern, then those of the next.
         before, slope = start.T.ravel().astype(np.float64), gradient.T.ravel().astype(np.float64)
         if self._learns and self.prior is None and start.any():
-            # to begin with, the curves as they are and all of the residual as noise
+            # The first prior takes the curves as they are, and all of the residual as noise.
             likely = np.square(start, dtype=np.float64).mean(1)
-            # of cosines that were not solved for nothing is known, and without light they would stay dark
+            # Nothing is known of cosines that were not solved for, and without light they would stay dark.
             likely[likely == 0] = np.median(likely[likely > 0])
             self.prior = CurvePrior(likely, energy / samples)
-        diagonal = np.diag_indices_from(gram)
+        equations, diagonal = NormalEquations(gram, slope, energy, samples), np.diag_indices_from(gram)
         for _ in range(EVIDENCE_STEPS if self._learns else 1):
             added = np.zeros(len(gram)) if self.prior is None else np.tile(self.prior.precision[:, 0], rank)
             matrix = gram.copy()
@@ -157,13 +155,11 @@ class CurveFit:
             if not self._learns:
                 break
             change = inverse @ (slope - added * before)
-            determined = np.clip(1 - added * np.diag(inverse), LEAST_DETERMINED, 1)
-            left = energy - 2 * float(change @ slope) + float(change @ gram @ change)
+            determined = determined_share(added, inverse)
             energies = (np.square(before + change) / determined).reshape(rank, cosines).mean(0)
             if not energies.max() > np.finfo(np.float32).tiny:
                 break  # the curves are 0, of which no prior can be learnt
-            noise = max(left, FAINTEST * energy) / max(samples - determined.sum(), 1.0)
-            self.prior = CurvePrior(energies, noise)
+            self.prior = CurvePrior(energies, equations.noise(change, determined))
         exact = self._problem.arrays.exact()
         solver = exact.asarray(inverse)
 
@@ -184,18 +180,14 @@ class CurveOperator:
         self._arrays, self._xp = cosines.arrays, cosines.arrays.xp
         self._width = segment.geometry.size + segment.geometry.substeps - 1
         substeps = np.arange(segment.geometry.span)
-        # (line, s): the n + S − 1 sub-steps that a line integrates
+        # (line, s): the n + S − 1 sub-steps that a line integrates.
         windows = np.asarray(self._firsts)[:, None] + np.arange(self._width)
         self._frame = self._arrays.indices(substeps // temporal_merge)
         self._windows = self._arrays.indices(windows.ravel())
         self._code = self._arrays.asarray(segment.code)
-        aligned = registration(segment.alignment, segment.geometry, 1, self._arrays)
-        view_b = patterns if aligned is None else aligned.forward(patterns)
-        blurred = blurring(segment.blur, segment.geometry, 1, self._arrays)
-        if blurred is not None:
-            patterns, view_b = blurred.forward(0, patterns), blurred.forward(1, view_b)
-        # arm B's rows are the scene's columns from right to left
-        views = (patterns, self._xp.flip(self._xp.permute_dims(view_b, (0, 2, 1)), axis=1))
+        view_a, view_b = seen_by_arms(segment, patterns, 1, self._arrays)
+        # Arm B's rows are the scene's columns from right to left.
+        views = (view_a, self._xp.flip(self._xp.permute_dims(view_b, (0, 2, 1)), axis=1))
         merging = self._arrays.asarray(column_merging(segment.geometry, 1))
         self._profiles = [_profiles(self._xp, view, merging, segment.geometry.substeps) for view in views]
         self._matrix = self._arrays.asarray(cosines.matrix())
@@ -214,12 +206,12 @@ class CurveOperator:
         back = lines[0, ...] @ a.T + lines[1, ...] @ b.T
         windows = xp.permute_dims(xp.reshape(back, (-1, self._rank, self._width)), (0, 2, 1))
         light = self._arrays.zeros((self._geometry.span, self._rank))
-        # windows overlap, and the array API has no addition at repeated indices
+        # Windows overlap, and the array API has no addition at repeated indices.
         for line, first in enumerate(self._firsts):
             light[first : first + self._width, :] += windows[line, ...]
         light = light * self._code[:, None]
         if self._merge > 1:
-            # dark sub-steps complete the last frame
+            # Dark sub-steps complete the last frame.
             missing = -light.shape[0] % self._merge
             dark = xp.zeros((missing, light.shape[1]), dtype=light.dtype, device=light.device)
             frames = xp.reshape(xp.concat([light, dark]), (-1, self._merge, light.shape[1]))
@@ -230,16 +222,16 @@ class CurveOperator:
         """The normal matrix of all samples in float64, unknowns in the order of (R, K)."""
         xp, K, R, exact = self._xp, self._matrix.shape[0], self._rank, self._arrays.exact()
         gram = exact.zeros((R, K, R, K))
-        # elsewhere G is 0
+        # Elsewhere G is 0.
         lit = self._arrays.indices(np.flatnonzero(host(self._code)))
-        # float64: rounding in float32 could make it indefinite
+        # float64 is needed: rounding in float32 could make it indefinite.
         cosines = exact.asarray(xp.take(self._matrix, xp.take(self._frame, lit), axis=1))
         cosines *= exact.asarray(xp.take(self._code, lit))
         shaped = [xp.reshape(exact.asarray(each), (R, self._width, -1)) for each in self._profiles]
         for k in range(R):
             for other in range(k + 1):
                 Q = sum(each[k, ...] @ each[other, ...].T for each in shaped)
-                # Σ_i Q(t − iS, t' − iS), of which only the sub-steps with light count
+                # This is Σ_i Q(t − iS, t' − iS), of which only the sub-steps with light count.
                 between = self._shifted(Q, self._geometry.lines)
                 between = xp.take(xp.take(between, lit, axis=0), lit, axis=1)
                 pair = cosines @ between @ cosines.T
@@ -250,7 +242,7 @@ class CurveOperator:
         """Σ_i Q shifted by iS in both directions, from the sum for half of the lines."""
         if lines == 1:
             return Q
-        # doubling adds up log₂ L large matrices instead of L
+        # Doubling adds up log₂ L large matrices instead of L.
         half, S = self._shifted(Q, lines // 2), self._geometry.substeps
         parts = [(0, half), (lines // 2 * S, half)] + [((lines - 1) * S, Q)] * (lines % 2)
         span = self._width + (lines - 1) * S
@@ -277,7 +269,7 @@ def _conjugate_gradients(
         if not energy > 0 or not curvature > 0:
             break
         x += (energy / curvature) * direction
-        # not in place: in the first step it is still the caller's `right`
+        # Not in place: in the first step it is still the caller's `right`.
         residual = residual - (energy / curvature) * image
         scaled = precondition(residual)
         energy, before = float(dot(residual, scaled)), energy

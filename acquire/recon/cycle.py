@@ -52,17 +52,17 @@ def find_period(theta: Array, basis: Basis) -> float | None:
     last = (basis.cosines - 1) / 2  # cosine k of the span is k/2 cycles in it
     tried = np.arange(round(FEWEST_CYCLES / STEP), int(last / FEWEST_HARMONICS / STEP))
     flat = host(theta).reshape(basis.count, -1).astype(np.float64)
-    # the first cosine is constant, and no part of the change
+    # The first cosine is constant, and no part of the change.
     gram = flat[1:] @ flat[1:].T
     change = float(np.trace(gram))
     if len(tried) < 3 or not change > ROUNDING * np.square(flat[0]).sum():
         return None
-    # the energy of the change at numbers of cycles in the span, on a grid of instants
+    # This is the energy of the change at numbers of cycles in the span, on a grid of instants.
     rows, cycles = basis.matrix(2 * basis.cosines)[1:].astype(np.float64), np.arange(0, last + STEP, STEP)
     instants, energy = rows.shape[1], np.zeros(len(cycles))
     angle = 2 * np.pi * cycles[:, None] * ((np.arange(instants) + 0.5) / instants - 0.5)
     for wave in (np.cos(angle), np.sin(angle)):
-        # a wave's mean square is ½
+        # A wave's mean square is ½.
         part = wave @ rows.T * (2 / instants) ** 0.5
         energy += (part @ gram * part).sum(1)
     harmonics = np.minimum(last // (tried * STEP), MOST_HARMONICS).astype(int)
@@ -99,7 +99,7 @@ def better_period(
 
     slope = (lines(cycles + NUDGE) - lines(cycles - NUDGE)) / (2 * NUDGE)
     left = host(problem.used_samples) - lines(cycles)
-    # lines without light have no slope
+    # Lines without light have no slope.
     step = stride * float((slope * left).sum() / max(np.square(slope).sum(), np.finfo(np.float64).tiny))
     fitted = basis.frames / (cycles + min(max(step, -FARTHEST), FARTHEST))
     return max(fitted, 2 * basis.harmonics / SHARE_OF_NYQUIST)  # shorter ones have fewer harmonics

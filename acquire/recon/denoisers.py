@@ -75,7 +75,7 @@ class HaarShrink:
 
     def prox(self, frames: Array, weight: float | Array) -> Array:
         """Shrink the details by ``weight``."""
-        # one threshold per frame, whether the weight is a number or (K,)
+        # There is one threshold per frame, whether the weight is a number or (K,).
         threshold = (namespace(frames).zeros_like(frames[:, 0, 0]) + weight)[:, None, None]
         smooth, details = frames, namespace(frames).zeros_like(frames)
         for level in range(self._levels):

@@ -28,7 +28,7 @@ PREDICTED_NOISE = 0.03
 """Relative noise up to which the held-out samples show that a code is not foreign. What is missed beyond the
 noise is a difference of squares: at this noise, a figure of it that is a tenth too large hides 1.4 % of the
 light, less than a foreign code misses. In less light, a foreign code's lines would look predicted, too."""
-SECONDS = 2.0
+DIAGNOSIS_S = 2.0
 """Wall time of a diagnosis: if the budget has less left, the budget is kept and the check is skipped."""
 
 
@@ -42,22 +42,22 @@ class DescriptionCheck:
 
 def check_description(segment: Segment, quality: Quality, clock: IterationClock) -> DescriptionCheck:
     """Find a description that explains the lines better than the segment's own, if there is one."""
-    # very few lines have no held-out samples, and a prediction that is NaN
+    # Very few lines have no held-out samples, and a prediction that is NaN.
     residual = float(np.nanmax([quality.misfit, quality.prediction]))
-    if not residual > SUSPICIOUS or not clock.affords(SECONDS):
+    if not residual > SUSPICIOUS or not clock.affords(DIAGNOSIS_S):
         return DescriptionCheck()
     found = diagnose(segment)
-    # some right descriptions are unclear: what is uncertain is not a contradiction
+    # Some right descriptions are unclear: what is uncertain is not a contradiction.
     believed = found.standing in (Standing.RIGHT, Standing.UNCLEAR)
     words = found.sentences
-    # not by the used samples: a video has voxels enough to follow their noise
+    # The used samples would not do: a video has voxels enough to follow their noise.
     predicted = (
         0 < quality.noise <= PREDICTED_NOISE
         and not math.isnan(quality.prediction)
         and quality.prediction**2 - quality.noise**2 < SUSPICIOUS**2
     )
     if found.standing is Standing.UNEXPLAINED and predicted:
-        # the video shows what the diagnosis, whose model is simpler, could not: the code does explain them
+        # The video shows what the diagnosis, whose model is simpler, could not: the code does explain them.
         words, believed = tuple(each for each in words if each != found.sentence), True
     if found.standing is Standing.RIGHT and residual > POOR_MISFIT:
         words += (

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
     from acquire.lines import Segment
 
-FEWEST_LINES, FEWEST_STAGES = 24, 4
+FEWEST_DIAGNOSED, FEWEST_STAGES = 24, 4
 """Fewest lines and stages for which anything is claimed."""
 TURNED = {
     Turn(pixels=True): "arm B is mirrored: its pixels are in the other order, or arm A's rows are",
@@ -94,10 +94,10 @@ def diagnose(segment: Segment, bits: Callable[[int, int], NDArray[np.uint8]] | N
     nothing = unusable(segment)
     if nothing:
         return Diagnosis(Standing.UNCLEAR, "the lines cannot be compared with their code", (), tuple(nothing))
-    if segment.geometry.lines < FEWEST_LINES or segment.geometry.stages < FEWEST_STAGES:
+    if segment.geometry.lines < FEWEST_DIAGNOSED or segment.geometry.stages < FEWEST_STAGES:
         few = f"{segment.geometry.lines} lines of {segment.geometry.stages} pixels are too few to tell"
         return Diagnosis(Standing.UNCLEAR, few)
-    # the matrices are small: more threads would wait for each other
+    # The matrices are small: more threads would wait for each other.
     with limit_threads(1):
         found = _diagnosed(LineModel(segment, bits))
     unequal = []
@@ -113,18 +113,18 @@ def _diagnosed(model: LineModel) -> Diagnosis:
     hypothesis = inquiry.best.hypothesis
     rows = tuple(_rows(model, inquiry))
     sentence = sentence_of(inquiry)
-    # no levels: under a code that did not make these lines they mean nothing
+    # Levels are not given: under a code that did not make these lines they mean nothing.
     if inquiry.standing is Standing.UNEXPLAINED:
         return Diagnosis(inquiry.standing, sentence, rows)
     if inquiry.standing is Standing.UNCLEAR:
-        return Diagnosis(inquiry.standing, sentence, rows, (), inquiry.described.hypothesis, hypothesis)
-    # the search may have ended under the prior of another hypothesis
+        described = inquiry.described.hypothesis
+        return Diagnosis(inquiry.standing, sentence, rows, hypothesis=described, alternative=hypothesis)
+    # The search may have ended under the prior of another hypothesis.
     model.fit_prior(hypothesis)
     found = tuple(suspicions(model, hypothesis))
     rival = inquiry.rival if inquiry.standing is Standing.NAMED else None
-    return Diagnosis(
-        inquiry.standing, sentence, rows, found, hypothesis, None if rival is None else rival.hypothesis
-    )
+    alternative = None if rival is None else rival.hypothesis
+    return Diagnosis(inquiry.standing, sentence, rows, found, hypothesis=hypothesis, alternative=alternative)
 
 
 def sentence_of(inquiry: Inquiry) -> str:
@@ -171,12 +171,12 @@ def _rows(model: LineModel, inquiry: Inquiry) -> list[Row]:
     """The table: common mistakes, one at a time, and the candidates that were found, likeliest first."""
     described = inquiry.described
     S, plain = model.substeps, described.hypothesis
-    # a sub-step or a whole line, either way
+    # A mistake is by a sub-step or a whole line, either way.
     tried = [replace(plain, late=(by, by)) for by in (1, -1, S, -S)]
     tried += [replace(plain, turn=turn) for turn in TURNED]
     tried.append(replace(plain, inverted=True))
     found = {candidate.hypothesis: candidate for candidate in inquiry.candidates}
-    # the prior of the description, with whose likelihood these are compared
+    # This is the prior of the description, with whose likelihood these are compared.
     model.fit_prior(plain)
     for each in tried:
         found.setdefault(each, Candidate(each, model.evidence(each)))

@@ -200,7 +200,7 @@ def combined_facts(parts: Sequence[Mapping[str, Any]], weights: Sequence[float])
     for part in parts:
         if "unknown" in part:
             return dict(part)
-    # mean squares add up, RMS errors do not
+    # Mean squares add up, RMS errors do not.
     found = {
         key: float(np.sqrt(np.average([part[key] ** 2 for part in parts], weights=weights)))
         for key in ("rms", "low", "high")
@@ -228,7 +228,7 @@ def measure_indicators(
     scale = full_scale(shown)
     if not (scale > 0 and residual > 0):
         return None
-    # what follows enters ratios and logarithms, so that none of it may be 0
+    # What follows enters ratios and logarithms, so that none of it may be 0.
     floor, mean = exponents.floor * scale, shown.mean(0)
     change, edge = np.zeros(mean.shape), np.zeros(mean.shape)
     for part in _parts(shown):
@@ -265,7 +265,7 @@ def error_from(indicators: Indicators, trusted: slice, exponents: Exponents | No
         * (indicators.change / change) ** exponents.local_change
         * (indicators.edge / edge) ** exponents.local_edge
     )
-    # regions share out the whole's error: their RMS is `error`, as is that of the trusted frames below
+    # Regions share out the whole's error: their RMS is `error`, as is that of the trusted frames below.
     regions = error * relative / rms_of(relative)
     frame_rms = np.sqrt(np.square(indicators.sensitivity).mean((1, 2)))
     frames = (frame_rms / whole) ** exponents.frame_sensitivity
@@ -285,7 +285,8 @@ def error_from(indicators: Indicators, trusted: slice, exponents: Exponents | No
 
 def log_indicators(sensitivity: float, indicators: Indicators) -> NDArray[np.float64]:
     """Logarithms of the whole video's indicators over the residual, one for each of ``Exponents.whole``."""
-    # relative to the residual, by which the product is multiplied: its degree is 1 whatever the exponents
+    # It is relative to the residual, by which the product is multiplied: its degree is 1 whatever the
+    # exponents.
     log_ratio = np.log(sensitivity / indicators.residual)
     excess = max(log_ratio, 0.0)
     fine = indicators.fine
@@ -295,7 +296,7 @@ def log_indicators(sensitivity: float, indicators: Indicators) -> NDArray[np.flo
 def in_regions(frames: NDArray[Any]) -> NDArray[np.float64]:
     """Means (time, 8, 8) of frames (time, row, column); a voxel in two regions counts with its shares."""
     side = frames.shape[1]
-    # (region, voxel): length of each voxel's overlap with each region, since 8 need not divide the side
+    # (region, voxel): length of each voxel's overlap with each region, since 8 need not divide the side.
     edges, voxel = np.linspace(0, side, REGIONS + 1), np.arange(side)
     overlap = np.minimum(edges[1:, None], voxel + 1) - np.maximum(edges[:-1, None], voxel)
     held = np.maximum(overlap, 0)

@@ -19,10 +19,11 @@ if TYPE_CHECKING:
     from acquire.recon.clock import IterationClock
     from acquire.recon.error import VideoError
     from acquire.recon.estimates import Estimate
+    from acquire.recon.given import Given
     from acquire.recon.problem import Problem
     from acquire.recon.result import Quality
 
-ITERATIONS = 15
+EXTRA_ITERATIONS = 15
 """Number of extra iterations used to estimate the error."""
 RESERVED_ITERATIONS = 18.0
 """Time reserved in a budget for the estimate, in iterations of the solver; fewer extra ones fit into it."""
@@ -57,31 +58,24 @@ class Continued:
 
 
 def estimate_error(
-    segment: Segment,
-    problem: Problem,
-    estimate: Estimate,
-    clock: IterationClock,
-    *,
-    video: NDArray[Any],
-    quality: Quality,
-    merges: tuple[int, int],
-    cut: bool,
+    given: Given, estimate: Estimate, *, video: NDArray[Any], quality: Quality, cut: bool
 ) -> VideoError | str:
     """Estimate the error of ``video`` (T/T_m, n/N_m, n/N_m) in scene units, or return why there is none.
 
-    ``merges`` are N_m and T_m. ``cut`` says that the solver was ended before it converged.
+    ``cut`` says that the solver was ended before it converged.
     """
-    trusted = segment.geometry.trusted_frames(merges[1])
+    segment, problem, clock, (N_m, T_m) = given.segment, given.problem, given.clock, given.merges
+    trusted = segment.geometry.trusted_frames(T_m)
     if not range(len(video))[trusted]:
         return "no frame is sampled in full"
     if not (isinstance(estimate, Continuable) and problem.held_out.any()):
         return UNSUPPORTED
     began_s = clock.processor_s
-    # before there is a second video: of a large sensor, each is a gigabyte
-    white = white_error(segment, problem, merges)
+    # It is measured before there is a second video: of a large sensor, each is a gigabyte.
+    white = white_error(segment, problem, given.merges)
     facts = estimate.facts()
     at_rest = facts.get("prior") == "still" or bool(facts.get("change"))
-    fine = at_rest and merges[0] < segment.geometry.substeps
+    fine = at_rest and N_m < segment.geometry.substeps
     if cut or fine or "patterns" in facts:
         exponents, residual = BY_PRIOR, float(np.nanmax([quality.misfit, quality.prediction]))
         continued = _under_heavier_prior(problem, estimate, video, trusted, clock)
@@ -98,7 +92,7 @@ def estimate_error(
         residual * white,
         trusted,
         exponents,
-        growth=(ITERATIONS / continued.made) ** continued.growth,
+        growth=(EXTRA_ITERATIONS / continued.made) ** continued.growth,
         drift=continued.drift,
         fine=fine,
     )
@@ -109,13 +103,13 @@ def estimate_error(
 
 def _with_fewer_lines(problem: Problem, estimate: Continuable, clock: IterationClock) -> Continued | str:
     """The video with another quarter of the lines withheld."""
-    # blocks of their own: those that the solver was judged by are in use meanwhile
+    # It gets blocks of its own: those that the solver was judged by are in use meanwhile.
     withheld = held_out_blocks(problem.usable, WITHHELD, WITHHELD_SEED)
     continuation = estimate.continue_with(problem.holding_out(withheld))
     if continuation is None:
         return UNSUPPORTED
     made = 0
-    for made, _ in enumerate(clock.run_reserved(ITERATIONS), 1):  # noqa: B007 (the count is used after the loop)
+    for made, _ in enumerate(clock.run_reserved(EXTRA_ITERATIONS), 1):  # noqa: B007 (the count is used after the loop)
         continuation.step()
     return Continued(continuation.video(), made, GROWTH) if made >= FEWEST else NO_TIME
 
@@ -128,13 +122,13 @@ def _under_heavier_prior(
     continuation = estimate.continue_with(problem, HEAVIER, still=True)
     if distances is None or continuation is None:
         return UNSUPPORTED
-    made, most = 0, max(distances, default=ITERATIONS)
+    made, most = 0, max(distances, default=EXTRA_ITERATIONS)
     reserved = clock.run_reserved(max(most, FEWEST_HEAVIER), FEWEST_HEAVIER)
     for made, _ in enumerate(reserved, 1):  # noqa: B007 (the count is used after the loop)
         continuation.step()
     if made < FEWEST_HEAVIER:
         return NO_TIME
-    # the drift's growth over the last half or more of the iterations
+    # The drift is the growth over the last half or more of the iterations.
     last = max(distances, default=0)
     early = max((each for each in distances if each <= last / 2), default=None)
     if early is None:
@@ -143,7 +137,7 @@ def _under_heavier_prior(
         floor = max(BY_PRIOR.floor * full_scale(video[trusted]), 1e-30)
         change = [np.hypot(distances[each], floor) for each in (early, last)]
         drift = float(np.clip(np.log(change[1] / change[0]) / np.log(last / early), -1, 1))
-    # a negative drift is that of a solver that converges: its change is not extrapolated to a smaller one
+    # A negative drift is that of a solver that converges: its change is not extrapolated to a smaller one.
     return Continued(continuation.video(), made, max(drift, 0.0), drift)
 
 
@@ -166,7 +160,7 @@ def _drift_distances(
         return rms_of(shown)
 
     made = 0
-    for made, _ in enumerate(clock.run_reserved(ITERATIONS, repeat=2 * EARLY[0]), 1):
+    for made, _ in enumerate(clock.run_reserved(EXTRA_ITERATIONS, repeat=2 * EARLY[0]), 1):
         continuation.step()
         if made in EARLY:
             distances[made] = distance()
@@ -185,8 +179,8 @@ def white_error(segment: Segment, problem: Problem, merges: tuple[int, int]) -> 
     operator = DualArm(
         segment.geometry, segment.code, *merges, alignment=segment.alignment, blur=segment.blur
     )
-    # random signs show the energy of independent errors, Σ of Λ′'s squared elements, without the matrix, and
-    # their RMS is exactly 1; from int8 and in place, because a video can be large
+    # Random signs show the energy of independent errors, Σ of Λ′'s squared elements, without the matrix, and
+    # their RMS is exactly 1. They are made from int8 and in place, because a video can be large.
     signs = np.random.default_rng(0).integers(0, 2, operator.video_shape, np.int8).astype(np.float32)
     signs *= 2
     signs -= 1

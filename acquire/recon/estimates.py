@@ -82,7 +82,7 @@ class InBand:
         held = self.basis.held
         last = np.flatnonzero(np.diff(held, append=held[-1] + 2) > 1)
         first = np.concatenate([[0], last[:-1] + 1])
-        # runs of successive cosines, from which `reconstruct` derives ``resolved_hz``
+        # These are the runs of successive cosines, from which `reconstruct` derives ``resolved_hz``.
         bands = [(int(held[a]), int(held[b]) + 1) for a, b in zip(first, last, strict=True)]
         return {"temporal_coefficients": self.basis.cosines, "bands": bands} | asdict(self._parameters)
 

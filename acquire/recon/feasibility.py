@@ -23,9 +23,9 @@ if TYPE_CHECKING:
 
 PROBED_SHARE = 6
 """The timed pass covers one sixth of the lines."""
-LOOK_S = 0.005
+PROBE_S = 0.005
 """Processor time for which the pass is repeated."""
-MARGIN, MARGIN_S = 0.1, 0.3
+OVERRUN_SHARE, OVERRUN_S = 0.1, 0.3
 """A budget may be exceeded by this share of it plus this many seconds."""
 
 
@@ -33,13 +33,13 @@ def least_seconds(geometry: Geometry, spatial_merge: int, temporal_merge: int, s
     """Wall time of the shortest reconstruction of such a segment, within a factor of two."""
     few = Geometry(geometry.stages, geometry.substeps, max(1, geometry.lines // PROBED_SHARE))
     code = np.random.default_rng(0).integers(0, 2, few.span).astype(np.uint8)
-    # a sixth of the lines may be shorter than a voxel
+    # A sixth of the lines may be shorter than a voxel.
     operator = DualArm(few, code, spatial_merge, min(temporal_merge, few.span))
     video = np.ones(operator.video_shape, np.float32)
     operator.adjoint(operator.forward(video))  # loads the compiled loops
-    # processor time, which a busy machine does not stretch; `slowness` says by how much wall time is longer
+    # A busy machine does not stretch processor time; `slowness` says by how much wall time is longer.
     used, passes = time.thread_time(), 0
-    while passes < 1 or time.thread_time() - used < LOOK_S:
+    while passes < 1 or time.thread_time() - used < PROBE_S:
         operator.adjoint(operator.forward(video))
         passes += 1
     once_s = (time.thread_time() - used) / passes
@@ -50,7 +50,7 @@ def least_seconds(geometry: Geometry, spatial_merge: int, temporal_merge: int, s
 def check_budget(clock: IterationClock, budget_s: float, least_s: float) -> None:
     """Raise UsageError unless ``budget_s`` can be kept when the remaining work takes ``least_s``."""
     needed = clock.seconds + least_s
-    if needed > (1 + MARGIN) * budget_s + MARGIN_S:
+    if needed > (1 + OVERRUN_SHARE) * budget_s + OVERRUN_S:
         raise UsageError(
             f"a budget of {budget_s:g} s cannot be kept: this segment needs at least {needed:.2g} s here",
             possible="a longer budget, fewer lines, larger voxels, or a machine that is less busy",

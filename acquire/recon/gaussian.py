@@ -13,7 +13,7 @@ them, which is all that is needed here.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import TYPE_CHECKING
 
@@ -28,7 +28,7 @@ FINE, SLOW, FAST = 4, 16, 128
 """Numbers of cosines that are resolved in fine rows, in rows as wide as pixels, and in few rows: sharp edges
 at rest would look like a delay if they fell between blocks."""
 FAST_ROWS = 16
-BLOCK_LINES = 24
+EVIDENCE_LINES = 24
 """Length of the blocks of lines in which evidence is counted; their spread gives its uncertainty."""
 SMALLEST = 1e-30
 
@@ -88,27 +88,30 @@ class Response:
     and ``finer`` the number of finest row blocks per pixel.
     """
 
-    def __init__(self, code: Floats, rows: int, substeps: int, lines: int, pixels: int, finer: int) -> None:
+    def __init__(
+        self, code: Floats, *, rows: int, substeps: int, lines: int, pixels: int, finer: int
+    ) -> None:
         self.lines, self.pixels, self.finer = lines, pixels, finer
         k = np.arange(FAST)[:, None]
         cosines = np.sqrt(2) * np.cos(np.pi * k * (np.arange(len(code)) + 0.5) / len(code))
         cosines[0] = 1
         lit = (cosines * code).T
-        # light in each window of S sub-steps, summed over time
+        # This is the light in each window of S sub-steps, summed over time.
         running = np.concatenate([np.zeros((1, FAST)), np.cumsum(lit, axis=0)])
         windows = running[substeps:] - running[:-substeps]
         running = np.concatenate([np.zeros((1, FAST)), np.cumsum(windows, axis=0)])
-        # summed twice, the light of any range of rows is a difference of two elements
+        # Summed twice, the light of any range of rows is a difference of two elements.
         first = (np.arange(lines) * substeps)[:, None]
         self.tiers: list[tuple[slice, NDArray[np.float32]]] = []
         tiers = ((0, FINE, pixels * finer), (FINE, SLOW, pixels), (SLOW, FAST, min(pixels, FAST_ROWS)))
         for begin, end, blocks in tiers:
-            # row r is exposed r sub-steps after the first
+            # Row r is exposed r sub-steps after the first.
             edges = np.linspace(0, rows, blocks + 1).round().astype(np.int64)
             sums = np.diff(running[:, begin:end][first + edges], axis=1)
-            # float32: the products with these take most of the time, and the noise is far above its rounding
+            # float32 is enough: the products with these take most of the time, and the noise is far above its
+            # rounding.
             self.tiers.append((slice(begin, end), sums.astype(np.float32)))
-        # a uniform scene at rest is cosine 0 in every block
+        # A uniform scene at rest is cosine 0 in every block.
         self.flat: Floats = self.tiers[0][1][:, :, 0].sum(1, dtype=np.float64)
 
     def covariance(self, prior: Prior) -> Floats:
@@ -155,17 +158,23 @@ class Model:
     @classmethod
     def of(cls, response: Response, prior: Prior, pixels: int) -> Model:
         covariance = response.covariance(prior)
-        # a prior's noise is relative to the light, whose mean variance becomes 1
+        # A prior's noise is relative to the light, whose mean variance becomes 1.
         unit = max(float(np.trace(covariance)) / len(covariance), SMALLEST)
         values, vectors = np.linalg.eigh(covariance / unit)
         across = np.linalg.eigh(correlation(pixels, prior.length))
-        # rounding of the float32 products leaves eigenvalues slightly below 0
-        return cls(response, prior, vectors, np.maximum(values, 0), across[1], across[0], unit)
+        # Rounding of the float32 products leaves eigenvalues slightly below 0.
+        return cls(
+            response,
+            prior,
+            _vectors=vectors,
+            _values=np.maximum(values, 0),
+            _pixel_vectors=across[1],
+            _pixel_values=across[0],
+            _unit=unit,
+        )
 
     def with_noise(self, noise: float) -> Model:
-        prior = Prior(self.prior.length, self.prior.change, self.prior.fast, noise)
-        kept = self._vectors, self._values, self._pixel_vectors, self._pixel_values, self._unit
-        changed = Model(self.response, prior, *kept)
+        changed = replace(self, prior=replace(self.prior, noise=noise))
         changed.__dict__["_level"] = self._level  # modes do not depend on the noise
         return changed
 
@@ -200,18 +209,19 @@ class Model:
         scale = max(float((rest**2 / self._variance).mean()), SMALLEST)
         amount = float(amounts[1]) if len(amounts) > 1 else 0.0
         lines = self.response.lines
-        # The log likelihood of a line is its part of the quadratic form, and an equal part of the rest.
-        # back from modes to lines; across pixels modes do as well, since sums of squares are the same
+        # The log likelihood of a line is its part of the quadratic form, and an equal part of the rest. For
+        # it, modes become lines again; across pixels modes do as well, since sums of squares are the same.
         values, pulled = self._vectors @ rest, self._vectors @ (rest / self._variance)
         per_line = (values * pulled).sum(1) / scale
         constant = (np.log(self._variance).sum() + rest.size * np.log(scale)) / lines
-        edges = np.linspace(0, lines, max(1, round(lines / BLOCK_LINES)) + 1).round().astype(int)
+        edges = np.linspace(0, lines, max(1, round(lines / EVIDENCE_LINES)) + 1).round().astype(int)
         evidence = np.asarray(-0.5 * np.add.reduceat(per_line + constant, edges[:-1]))
         return Fit(rest, float(amounts[0]), scale, evidence, amount)
 
     def evidence(self, modes: Floats) -> float:
         """Log likelihood of lines given as modes."""
-        # as `fit` with its single regressor, but without the blocks: the ladder tries this for every noise
+        # This is `fit` with its single regressor, but without the blocks: the ladder tries this for every
+        # noise.
         level, weighted = self._level, self._level / self._variance
         rest = modes - float((weighted * modes).sum() / (weighted * level).sum()) * level
         scale = max(float((rest**2 / self._variance).mean()), SMALLEST)
@@ -227,7 +237,7 @@ class Model:
 
     def scene(self, fit: Fit) -> NDArray[np.float32]:
         """The most likely slow scene (fine row, cosine, pixel), in units of the lines per sub-step."""
-        # C⁻¹·lines, then the prior's covariance times Fᵀ: the mean of the scene given the lines
+        # The mean of the scene given the lines is the prior's covariance times Fᵀ·C⁻¹·lines.
         pulled = self._vectors @ (fit.modes / self._variance) / self._unit
         pulled = ((pulled * self._pixel_values) @ self._pixel_vectors.T).astype(np.float32)
         parts = []
@@ -236,7 +246,7 @@ class Model:
             part = np.tensordot(near, np.tensordot(factor, pulled, axes=(0, 0)), axes=1)
             part *= self.prior.spectrum[cosines, None].astype(np.float32)
             parts.append(np.repeat(part, self.response.pixels * self.response.finer // len(part), axis=0))
-        # u is steady (cosine 0) and the same in all rows
+        # u is steady (cosine 0) and the same in all rows.
         parts[0][:, 0] += np.float32(fit.level)
         return np.concatenate(parts, axis=1)
 
@@ -265,7 +275,7 @@ def best_model(response: Response, arms: list[Floats]) -> Model:
         model = Model.of(response, step, arms[0].shape[1])
         modes = [model.modes(arm) for arm in arms]
         for noise in NOISES:
-            # noise only adds to the eigenvalues: one decomposition serves all
+            # Noise only adds to the eigenvalues: one decomposition serves all.
             noisy = model.with_noise(noise)
             total = sum(noisy.evidence(each) for each in modes)
             if best is None or total > best[0]:

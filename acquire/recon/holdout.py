@@ -46,16 +46,16 @@ def held_out_blocks(
             f"held-out blocks cannot have {lines} lines × {pixels} pixels", possible="1 or more of each"
         )
     rng = np.random.default_rng(seed)
-    # halve the longer side until there are enough blocks
+    # Halve the longer side until there are enough blocks.
     while lines * pixels > 1 and usable.size * share < FEWEST_BLOCKS * lines * pixels:
         lines, pixels = (-(-lines // 2), pixels) if lines >= pixels else (lines, -(-pixels // 2))
     drawn: list[NDArray[np.bool_]] = []
     for arm in usable:
-        # one more than cover the arm, because the origin is random
+        # There is one more than cover the arm, because the origin is random.
         tiles = [-(-length // side) + 1 for length, side in zip(arm.shape, (lines, pixels), strict=True)]
         count = tiles[0] * tiles[1]
         chosen = np.zeros(count, bool)
-        # rounded at random, so that the share is right on average even if there are few tiles
+        # The count is rounded at random, so that the share is right on average even if there are few tiles.
         chosen[rng.permutation(count)[: int(count * share + rng.random())]] = True
         line, pixel = (int(rng.integers(side)) for side in (lines, pixels))
         whole = chosen.reshape(tiles).repeat(lines, axis=0).repeat(pixels, axis=1)
@@ -73,7 +73,7 @@ class HeldOut:
     def __init__(self, problem: Problem, geometry: Geometry) -> None:
         mask = problem.held_out
         labels = [label(arm)[0] for arm in mask]
-        # blocks are numbered through both arms
+        # Blocks are numbered through both arms.
         labels[1] = np.where(labels[1] > 0, labels[1] + labels[0].max(), 0)
         self._block = np.stack(labels)[mask]
         self._samples = problem.samples[mask].astype(np.float64)
@@ -94,7 +94,7 @@ class HeldOut:
     def errors(self, predicted: NDArray[Any]) -> NDArray[np.float64]:
         """Weighted sum of squared errors of each block."""
         squares = self._weight * (predicted[self._mask] - self._samples) ** 2
-        # label 0 is what lies between the blocks
+        # Label 0 is what lies between the blocks.
         return np.asarray(np.bincount(self._block, squares)[1:], np.float64)
 
     def relative(self, errors: NDArray[np.float64]) -> float:

@@ -144,7 +144,7 @@ class LineModel:
         self._size, self.alignment = segment.geometry.size, segment.alignment
         self.first, self.arms = prepared_lines(segment)
         self.lines, self.pixels = self.arms[0].shape
-        # a cache of this object alone: it ends with it, and another prior can empty it
+        # The cache belongs to this object alone: it ends with it, and another prior can empty it.
         self._view = lru_cache(maxsize=64)(self._make_view)
         self._prior: Prior | None = None
 
@@ -163,21 +163,21 @@ class LineModel:
     @prior.setter
     def prior(self, prior: Prior) -> None:
         self._prior = prior
-        # views contain the prior's eigenvectors
+        # Views contain the prior's eigenvectors.
         self._view.cache_clear()
 
     def evidence(self, hypothesis: Hypothesis) -> Evidence:
         views = [self.view(hypothesis, arm) for arm in (0, 1)]
         own = [view.fits[arm].blocks for arm, view in enumerate(views)]
         turn = hypothesis.turn
-        # both in arm A's axes, for the alignment: a displaced arm would otherwise seem early or late
+        # Both are in arm A's axes, for the alignment: a displaced arm would otherwise seem early or late.
         a, b = views[0].scene(0), turn.to_a(views[1].scene(1))
         if self.alignment is not None:
             a, b = (
                 _displaced(a, self._size, self.alignment.to_a),
                 _displaced(b, self._size, self.alignment.to_b),
             )
-        # what arm B saw predicts arm A, and the other way round
+        # What arm B saw predicts arm A, and the other way round.
         scenes = (b, turn.to_b(a))
         gain = [view.gain(arm, each) for arm, (view, each) in enumerate(zip(views, scenes, strict=True))]
         return Evidence(np.concatenate(own), np.concatenate(gain))
@@ -193,14 +193,14 @@ class LineModel:
     def _response(self, inverted: bool, late: int, substeps: int, random_code: int) -> Response:
         rows = self.stages * substeps
         span = substeps * (self.lines + self.stages) - 1
-        # late lines show earlier bits
+        # Late lines show earlier bits.
         code = self._bits(substeps * self.first - late, span).astype(np.float64)
         if random_code:
             code = np.random.default_rng(random_code).integers(0, 2, span).astype(np.float64)
-        # a multiple of the pixels, since the arms exchange rows and pixels
+        # The number is a multiple of the pixels, since the arms exchange rows and pixels.
         finer = max(1, min(rows, MOST_BLOCKS) // self.pixels)
         lit = 1 - code if inverted else code
-        return Response(lit, rows, substeps, self.lines, self.pixels, finer)
+        return Response(lit, rows=rows, substeps=substeps, lines=self.lines, pixels=self.pixels, finer=finer)
 
 
 class View:

@@ -58,7 +58,7 @@ class JoinedOperator:
         return self._volume.forward(volume) + self._patterns.forward(patterns)
 
     def adjoint(self, lines: Array) -> Array:
-        # θ₁ is stored s times too large
+        # θ₁ is stored s times too large.
         volume = self._volume.adjoint(lines) / self._layout.scale**2
         return self._layout.joined(volume, self._patterns.adjoint(lines))
 

@@ -42,25 +42,26 @@ def frame_error(
     per_line = np.stack(
         [np.square(error).sum((0, 2)), np.square(np.where(usable, problem.samples, 0.0)).sum((0, 2))]
     )
-    # a frame is seen by n/S lines and more: differences of running sums instead of sums of their own
+    # A frame is seen by n/S lines and more: differences of running sums are taken instead of sums of their
+    # own.
     running = np.concatenate([np.zeros((2, 1)), np.cumsum(per_line, axis=1)], axis=1)
-    # the lines whose exposure overlaps each frame are first .. last − 1
+    # The lines whose exposure overlaps each frame are first .. last − 1.
     S, L = geometry.substeps, geometry.lines
     begins = np.arange(0, geometry.span, temporal_merge)
     ends = np.minimum(begins + temporal_merge, geometry.span)
-    # line ℓ exposes the sub-steps ℓS .. ℓS + n + S − 2
+    # Line ℓ exposes the sub-steps ℓS .. ℓS + n + S − 2.
     first = np.clip(-(-(begins - (geometry.size + S - 2)) // S), 0, L)
     last = np.clip((ends - 1) // S + 1, 0, L)
     residual, level = running[:, last] - running[:, first]
     with np.errstate(invalid="ignore", divide="ignore"):
-        # differences of running sums can be slightly negative by rounding
+        # Differences of running sums can be slightly negative by rounding.
         ratio = np.sqrt(np.maximum(residual, 0) / level)
     return np.where(level > 0, ratio, np.nan).astype(np.float32)
 
 
 def judge(segment: Segment, problem: Problem, quality: Quality, trusted: slice) -> tuple[str, ...]:
     """Return the reasons not to trust this video, as sentences for the user."""
-    # a constant code is reported below, by its density
+    # A constant code is reported below, by its density.
     found = [
         each.words for each in (*unusable(segment), *black_level_off(segment)) if each.kind != "constant_code"
     ]
@@ -76,7 +77,7 @@ def judge(segment: Segment, problem: Problem, quality: Quality, trusted: slice) 
             f"where noise alone is {quality.noise:.2%}, and the held-out samples by "
             f"{quality.prediction:.2%}; larger voxels have less noise"
         )
-    # above `POOR_MISFIT` the first warning says more
+    # Above `POOR_MISFIT` the first warning says more.
     if quality.standing == "not explained" and WORTH_SAYING < residual <= POOR_MISFIT:
         found.append(
             f"the video misses the lines by {residual:.2%}, and their noise is {quality.noise:.2%}: the rest "

@@ -30,7 +30,7 @@ overflow."""
 SIGN_PIXELS = 1024
 """Pixels of all coefficients that are handled together: they stay in a core's nearest cache."""
 
-# without nnan and ninf: solvers notice that they diverge by values that are not finite
+# nnan and ninf are left out: solvers notice that they diverge by values that are not finite.
 _FAST = {"contract", "reassoc", "nsz", "arcp"}
 
 
@@ -52,7 +52,7 @@ def tv_prox(
         for _ in range(iterations):
             _primal(frames[k], ahead[0], ahead[1], weights[k], out[k])
             following = (1 + np.sqrt(1 + 4 * momentum * momentum)) / 2
-            # in the frames' dtype: with a float64, the loops would compute in double precision
+            # It has the frames' dtype: with a float64, the loops would compute in double precision.
             push = out.dtype.type((momentum - 1) / following)
             _dual_step(out[k], weights[k], push, dual[k, 0], dual[k, 1], ahead[0], ahead[1])
             momentum = following
@@ -88,7 +88,7 @@ def _dual_step(
     branches and the compiler can use vector instructions.
     """
     rows, columns = x.shape
-    # 8 bounds the squared norm of the differences along two axes: a longer step may diverge
+    # 8 bounds the squared norm of the differences along two axes: a longer step may diverge.
     one, step = x.dtype.type(1), x.dtype.type(1) / (x.dtype.type(8) * weight)
     for r in range(rows - 1):
         for c in range(columns - 1):
@@ -127,12 +127,13 @@ def joint_tv_prox(
         out[:] = frames
         return
     rows = frames.shape[1]
-    # of the dual problem of all frames, whose gradient has a Lipschitz constant of 8·(largest weight)²
+    # The gradient of the dual problem of all frames has a Lipschitz constant of 8·(largest weight)².
     steps = weights / (8 * largest * largest)
     ahead = dual.copy()
     momentum = 1.0
     for _ in range(iterations):
-        # two loops: the dual step of a row needs the primal's next row, and the primal the dual's row before
+        # There are two loops: the dual step of a row needs the primal's next row, and the primal the dual's
+        # row before.
         for r in numba.prange(rows):
             _joint_primal(frames, ahead, r, weights, out)
         following = (1 + np.sqrt(1 + 4 * momentum * momentum)) / 2
@@ -199,7 +200,7 @@ def tv_value(frames: NDArray[Any], out: NDArray[np.float64]) -> None:
         for r in range(rows):
             for c in range(columns):
                 x = frames[k, r, c]
-                # x − x, not 0.0, which would make both branches float64
+                # It is x − x and not 0.0, which would make both branches float64.
                 down = frames[k, r + 1, c] - x if r < rows - 1 else x - x
                 right = frames[k, r, c + 1] - x if c < columns - 1 else x - x
                 total += np.sqrt(down * down + right * right)
@@ -246,7 +247,8 @@ def _volume_primal(
     _primal(b[t], dual[0, t], dual[1, t], weight, x)
     w = x.dtype.type(weight * pace)
     rows, columns = x.shape
-    # at the first instant, the last one's: the difference across the ends of a cycle, otherwise 0
+    # At the first instant, the one before is the last: the difference across the ends of a cycle, otherwise
+    # 0.
     before = dual[2, t - 1]
     for r in range(rows):
         for c in range(columns):
@@ -271,7 +273,7 @@ def _volume_dual_step(
     _, rows, columns = x.shape
     one, slow = x.dtype.type(1), x.dtype.type(step * pace)
     for r in range(rows):
-        # where there is no neighbour, it is the voxel itself: a difference of 0
+        # Where there is no neighbour, it is the voxel itself: a difference of 0.
         here, below, later = x[t, r], x[t, min(r + 1, rows - 1)], x[after, r]
         p, q, s = dual[0, t, r], dual[1, t, r], dual[2, t, r]
         p_ahead, q_ahead, s_ahead = ahead[0, t, r], ahead[1, t, r], ahead[2, t, r]

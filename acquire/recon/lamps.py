@@ -40,17 +40,18 @@ if TYPE_CHECKING:
     from acquire.lines import Segment
     from acquire.recon.problem import Problem
 
-ITERATIONS, FEWEST_ITERATIONS = 5, 3
+LIKELIHOOD_STEPS, FEWEST_STEPS = 5, 3
+"""Number of steps towards the largest likelihood, and of those that are made in a hurry."""
 WINDOW, PEAK_WIDTH = 61, 3
 """Number of neighbouring cosines whose median is the floor, and number over which the light of a lamp
 spreads."""
 FALSE_ALARMS = 1e-3
 """Share of searches that mistake chance for light, if the logarithms about the floor were normal."""
-USUAL = 0.9
+SCATTER_QUANTILE = 0.9
 """Quantile that measures their upward scatter."""
-LONGEST = 520
+LONGEST_PART = 520
 """Largest number of lines that are analysed together: the time grows with their square."""
-SECONDS = 6e-10
+SECONDS_EACH = 6e-10
 """Processor time for each cosine, row and pair of lines."""
 LARGEST_FACTOR_BYTES, CHUNK_BYTES = 1 << 29, 1 << 26
 LEAST_NOISE = 1e-7
@@ -65,10 +66,10 @@ FEWEST_LOOKED_AT = 128
 
 def search_seconds(geometry: Geometry, temporal_merge: int, share: float) -> float:
     """Approximate processor time of `last_lamp`."""
-    parts = -(-geometry.lines // LONGEST)
+    parts = -(-geometry.lines // LONGEST_PART)
     one = replace(geometry, lines=-(-geometry.lines // parts))
     cosines = share * one.video_shape(1, temporal_merge)[0]
-    return float(SECONDS * parts * cosines * one.stages * one.lines**2)
+    return float(SECONDS_EACH * parts * cosines * one.stages * one.lines**2)
 
 
 def last_lamp(
@@ -85,7 +86,9 @@ def last_lamp(
     """
     frames = segment.geometry.video_shape(1, temporal_merge)[0]
     last = 0.0
-    for lines in np.array_split(np.arange(segment.geometry.lines), -(-segment.geometry.lines // LONGEST)):
+    for lines in np.array_split(
+        np.arange(segment.geometry.lines), -(-segment.geometry.lines // LONGEST_PART)
+    ):
         geometry = replace(segment.geometry, lines=len(lines))
         first = int(lines[0]) * geometry.substeps
         code = segment.code[first : first + geometry.span]
@@ -95,7 +98,7 @@ def last_lamp(
             most = int(share * looked_at)
             factor = _factor(geometry, code, temporal_merge, most)
             energy = _relative_energy(factor, problem.samples[:, lines], seen, hurry)
-            # as a share of the part's cosines: their spacing depends on its length
+            # The result is a share of the part's cosines: their spacing depends on its length.
             last = max(last, _end_of_peaks(energy, most) / looked_at)
     return round(last * frames)
 
@@ -111,20 +114,20 @@ def _relative_energy(
     All 0 if the lines do not separate the cosines.
     """
     K, rows, L = factor.shape
-    # pixels of both arms alike: C sums over rows, so that their order does not matter
+    # The pixels of both arms are alike: C sums over rows, so that their order does not matter.
     pixels, seen = np.hstack(list(samples)), np.hstack(list(usable))
     kept = seen.any(0)
     pixels, seen = pixels[:, kept].astype(np.float32), seen[:, kept]
-    # mean square 1, which the first values of light and noise presuppose
+    # The mean square becomes 1, which the first values of light and noise presuppose.
     pixels /= max(np.sqrt(np.square(pixels, dtype=np.float64).sum() / seen.sum()), np.finfo(np.float32).tiny)
     response = np.square(factor).sum((1, 2), dtype=np.float64)
     if not response.min() > LEAST_RESPONSE * response.max():
         return np.zeros(K)
-    # to begin with, all cosines have the same share, and together half of the mean square
+    # At first, all cosines have the same share, and together half of the mean square.
     light, noise = 0.5 * L / (K * response), 1e-3
     chunk = max(1, CHUNK_BYTES // (4 * rows * L))
     chunks = [slice(k, k + chunk) for k in range(0, K, chunk)]
-    for made in range(ITERATIONS):
+    for made in range(LIKELIHOOD_STEPS):
         inverse = _inverse(factor, chunks, light, noise)
         white = _whitened(inverse, pixels, seen)
         explained, expected = np.empty(K), np.empty(K)
@@ -137,13 +140,13 @@ def _relative_energy(
         samples_each = seen.mean() * seen.shape[1]
         largest = float(np.finfo(np.float32).max) * min(trace, float(expected.min())) * samples_each
         if not (light * explained).max() < largest:
-            # rounding error: under a code that hardly changes, the lines do not separate cosines
+            # This is rounding error: under a code that hardly changes, the lines do not separate cosines.
             return np.zeros(K)
-        # the root is that of the minorisation: the likelihood rises in every step, whatever the start
+        # The root is that of the minorisation: the likelihood rises in every step, whatever the start.
         light *= np.sqrt(explained / (samples_each * expected))
         left = np.square(white, dtype=np.float64).sum() / samples_each
         noise = max(LEAST_NOISE, noise * float(np.sqrt(left / trace)))
-        if made + 1 >= FEWEST_ITERATIONS and hurry():
+        if made + 1 >= FEWEST_STEPS and hurry():
             break
     inverse = _inverse(factor, chunks, light, noise)
     white = _whitened(inverse, pixels, seen)
@@ -157,7 +160,7 @@ def _factor(
     frames = geometry.video_shape(1, temporal_merge)[0]
     count = max(most, min(frames // 2, FEWEST_LOOKED_AT))
     basis, merge = TemporalBasis(frames, count), geometry.substeps
-    # rows are as wide as pixels, or wider where the factor would take too much memory
+    # Rows are as wide as pixels, or wider where the factor would take too much memory.
     while 4 * basis.count * geometry.lines * geometry.size > LARGEST_FACTOR_BYTES * merge:
         merge += geometry.substeps
     starts, lengths = block_bounds(geometry.size, merge)
@@ -186,7 +189,7 @@ def _whitened(
     holes = ~seen
     if not holes.any():
         return white
-    # pixels with the same holes share the inverse of a small matrix
+    # Pixels with the same holes share the inverse of a small matrix.
     patterns, of = np.unique(holes, axis=1, return_inverse=True)
     for number, hole in enumerate(patterns.T):
         if hole.any():
@@ -203,8 +206,8 @@ def _left_out(
 ) -> float:
     """For one cosine (rows, L_R): energy that it explains if C is without it, relative to that by chance."""
     own = (flat @ inverse @ flat.T).astype(np.float64)
-    # F_kᵀ·(C − p·F_k·F_kᵀ)⁻¹ = (I − p·F_kᵀ·C⁻¹·F_k)⁻¹·F_kᵀ·C⁻¹
-    # slightly more than 1, because a cosine that is all of C would make it singular
+    # F_kᵀ·(C − p·F_k·F_kᵀ)⁻¹ = (I − p·F_kᵀ·C⁻¹·F_k)⁻¹·F_kᵀ·C⁻¹. The diagonal is slightly more than 1, because
+    # a cosine that is all of C would make it singular.
     without = np.linalg.inv((1 + 1e-6) * np.eye(len(own)) - light * own)
     expected = float(np.einsum("ij,ji->", without, own))
     explained = float(np.square(without.astype(np.float32) @ (flat @ white)).sum(dtype=np.float64))
@@ -217,6 +220,6 @@ def _end_of_peaks(energy: NDArray[np.float64], most: int) -> int:
         return 0
     level = np.log(uniform_filter1d(energy, PEAK_WIDTH, mode="nearest"))
     level -= median_filter(level, WINDOW, mode="nearest")
-    spread = np.quantile(level, USUAL) / ndtri(USUAL)
+    spread = np.quantile(level, SCATTER_QUANTILE) / ndtri(SCATTER_QUANTILE)
     above = np.flatnonzero(level[:most] > ndtri(1 - FALSE_ALARMS / len(level)) * spread)
     return int(above[-1]) + 1 if len(above) else 0

@@ -70,7 +70,7 @@ class SolveOptions:
             raise UsageError(
                 f"{self.iterations!r} iterations are not possible", possible="an integer of at least 1"
             )
-        # solvers name in `takes` what they support, so that nothing is ignored silently
+        # Solvers name in `takes` what they support, so that nothing is ignored silently.
         for option, given in (
             ("initial", self.initial),
             ("denoiser", self.denoiser),
@@ -82,7 +82,7 @@ class SolveOptions:
                     f"solver {self.solver!r} takes no {option}", possible=f"solver {', '.join(able)}"
                 )
 
-        # imported here: it needs these options
+        # Imported late, because it needs these options itself.
         from acquire.recon.reuse import Choice
 
         if self.choice is not None and not isinstance(self.choice, Choice):
@@ -95,7 +95,7 @@ class SolveOptions:
         """Raise UsageError unless the given arrays are finite and fit the segment."""
         _check_array("initial video", self.initial, video_shape)
         _check_array("static image", self.static_image, (size, size))
-        # the curve is relative to the image's norm
+        # The curve is relative to the image's norm.
         if self.static_image is not None and not np.any(self.static_image):
             raise UsageError(
                 "the static image is dark everywhere", possible="an image of the lit scene at rest"

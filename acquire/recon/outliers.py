@@ -29,7 +29,7 @@ SPIKE_LEVEL = 0.5
 FENCE = 1.5
 """Distance of a spike from the middle half of its column's samples, in their range (Tukey's inner fences)."""
 HOT_RATIO = 10.0
-STEADY = 0.5 / 3**0.5
+DEFECT_SPREAD = 0.5 / 3**0.5
 """Relative standard deviation of a hot column's lines at most, times √M: light under a random code varies by
 1/√(S·M) if it fills all rows, as a slit, and more if it fills fewer; defects need not vary at all."""
 FEWEST_VARYING = 0.1
@@ -53,7 +53,7 @@ def outliers(samples: NDArray[Any], mask: NDArray[np.bool_]) -> dict[str, NDArra
 def _spikes(samples: NDArray[np.float64], left: NDArray[np.bool_]) -> NDArray[np.bool_]:
     if samples.shape[1] < SPIKE_LINES or not left.any():
         return np.zeros_like(left)
-    # along lines only: neighbouring lines share their light, neighbouring columns need not
+    # Only along lines: neighbouring lines share their light, neighbouring columns need not.
     deviation = np.abs(samples - median_filter(samples, size=(1, SPIKE_LINES, 1), mode="nearest"))
     spread = robust_sigma(deviation[left])
     level = np.quantile(np.abs(samples[left]), 0.99)
@@ -73,15 +73,18 @@ def _hot(samples: NDArray[np.float64], left: NDArray[np.bool_]) -> NDArray[np.bo
     if samples.shape[1] < FEWEST_LINES:
         return np.zeros_like(left)
     medians = np.median(np.abs(samples), axis=1, keepdims=True)
-    # of nearly all columns, not of the middle one: most of a scene may be dark
+    # The usual level is that of nearly all columns, not of the middle one: most of a scene may be dark.
     usual = np.quantile(medians, 0.9, axis=2, keepdims=True)
     bright = (medians > HOT_RATIO * usual) & (usual > 0)
     if not bright.any():
         return np.zeros_like(left)
 
     # A lamp or a slit on dark ground is in few columns, too. It follows the code, and both arms see all of
-    # its light: their totals agree better with it than without it. By medians, which spikes do not change.
-    follows = bright & (samples.std(axis=1, keepdims=True) > STEADY / samples.shape[2] ** 0.5 * medians)
+    # its light: their totals agree better with it than without it. Medians are taken, which spikes do not
+    # change.
+    follows = bright & (
+        samples.std(axis=1, keepdims=True) > DEFECT_SPREAD / samples.shape[2] ** 0.5 * medians
+    )
     total, without = medians.sum(axis=2, keepdims=True), (medians * ~follows).sum(axis=2, keepdims=True)
     with np.errstate(divide="ignore", invalid="ignore"):
         seen_by_both = np.abs(np.log(total / total[::-1])) < np.abs(np.log(without / total[::-1]))
@@ -95,15 +98,15 @@ def _stuck(samples: NDArray[np.float64], left: NDArray[np.bool_]) -> NDArray[np.
     high = np.where(left, samples, -np.inf).max(axis=1, keepdims=True)
     usual = (high > low).mean(axis=2, keepdims=True) > FEWEST_VARYING
     still = high <= low
-    # unlit columns are at 0 or, if the black level is wrong, several of them share the lowest value
+    # Unlit columns are at 0 or, if the black level is wrong, several of them share the lowest value.
     lowest = np.where(np.isfinite(low), low, np.inf).min(axis=2, keepdims=True)
     shared = (still & (high == lowest)).sum(axis=2, keepdims=True) >= FEWEST_TOGETHER
     darkness = np.where(shared, lowest, 0.0)
     brightest = np.abs(samples).max(axis=(1, 2), keepdims=True)
     dark = still & (np.abs(high - darkness) <= 1e-3 * brightest)
-    # a single dark column between lit ones is stuck: dark parts of a scene are mostly wider
+    # A single dark column between lit ones is stuck: dark parts of a scene are mostly wider.
     lit = np.median(np.abs(samples), axis=1, keepdims=True) > 0.1 * brightest
-    # an outermost column has one neighbour: itself stands for the other
+    # An outermost column has one neighbour: it stands for the other itself.
     padded = np.pad(lit, ((0, 0), (0, 0), (1, 1)), mode="edge")
     lonely = dark & padded[:, :, :-2] & padded[:, :, 2:]
     return np.asarray(np.broadcast_to(still & usual & (~dark | lonely), samples.shape))

@@ -18,7 +18,7 @@ from __future__ import annotations
 
 from copy import copy
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
@@ -33,8 +33,9 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from acquire.arrays import Array
-    from acquire.lines import Segment
     from acquire.recon.basis import TemporalBasis
+    from acquire.recon.estimates import InBand
+    from acquire.recon.given import Given
     from acquire.recon.problem import MaskedOperator, Operator, Problem
 
 LARGEST_RANK = 12
@@ -70,11 +71,11 @@ by frame, faint patterns lose their edges in the noise, the curves take up the e
 2 dB lower."""
 ROUND = 5
 """Number of ADMM iterations between two fits of the curves."""
-RIDGE = 3e-3
+CURVE_DAMPING = 3e-3
 """Levenberg's damping of the curves' fit: it slows the curves down, so that the patterns can follow, and does
 not change the fixed point. With a tenth of it the two chase each other and diverge from the truth."""
-PENALTY_DECAY, LEAST_PENALTY = 0.8, 1 / 4
-WEIGHT_DECAY, LEAST_WEIGHT = 0.75, 1 / 16
+PENALTY_DECAY, LAST_PENALTY = 0.8, 1 / 4
+WEIGHT_DECAY, LAST_WEIGHT = 0.75, 1 / 16
 """Factors of the penalties ρ and of λ from round to round, and their limits: weights that stabilise the
 iterates while patterns and curves are wrong would flatten them once they are right."""
 
@@ -101,10 +102,10 @@ def find_patterns(theta: NDArray[Any], *, beyond_doubt: bool = False) -> Pattern
     if count <= TAIL:
         return None
     flat = theta.reshape(count, -1).astype(np.float64)
-    # of a K × K matrix: there are many more pixels than cosines
+    # The matrix is K × K: there are many more pixels than cosines.
     energy, vectors = np.linalg.eigh(flat @ flat.T)
     energy, vectors = np.maximum(energy[::-1], 0), vectors[:, ::-1]
-    # energies are squares of singular values, for whose ratios the limits are given
+    # Energies are squares of singular values, for whose ratios the limits are given.
     gaps = np.flatnonzero(energy[: TAIL - 1] > GAP**2 * energy[1:TAIL]) + 1
     rank = int(gaps[-1]) if len(gaps) else 0
     if not _is_enough(rank, energy, LARGEST_REST_AT_GAP):
@@ -117,6 +118,11 @@ def find_patterns(theta: NDArray[Any], *, beyond_doubt: bool = False) -> Pattern
             return None
     curves = vectors[:, :rank].astype(theta.dtype)
     return Patterns(curves, (curves.T @ theta.reshape(count, -1)).reshape(rank, side, side))
+
+
+def has_clear_patterns(look: InBand) -> bool:
+    """Whether the scene is evidently a sum of a few patterns."""
+    return find_patterns(host(look.solver.theta), beyond_doubt=True) is not None
 
 
 def _above_floor(energy: NDArray[np.float64], noise: float) -> int:
@@ -137,30 +143,94 @@ def _is_enough(rank: int, energy: NDArray[np.float64], rest: float) -> bool:
     return bool(0 < rank <= LARGEST_RANK and energy[rank:].sum() <= rest * energy.sum())
 
 
-class Refinement:
-    """Refines patterns and curves in turn: `step` is an ADMM iteration; a round ends with the curves' fit."""
+class Unknowns(Protocol):
+    """What the solver of a refinement solves for: `PatternsAlone`, or a volume as well (`beside_motion`).
 
-    share: ClassVar[float] = 1.0
+    Everything in which these refinements differ is here. ``found`` are patterns in pixels.
+    """
+
+    share: float
     """Factor of λ and ρ."""
-    loosens: bool = True
+    loosens: bool
     """Whether λ is lowered from round to round."""
+
+    def stacked(self, found: Patterns) -> Array:
+        """All unknowns in one array θ, as the solver holds them."""
+        ...
+
+    def unstacked(self, theta: Array, found: Patterns) -> Patterns:
+        """θ as patterns, with the curves of what was ``found``."""
+        ...
+
+    def operator(self, patterns: Operator, found: Patterns, /) -> Operator:
+        """Lines of θ, given the operator of the patterns."""
+        ...
+
+    def priors(
+        self, found: Patterns, basis: LearnedBasis, parameters: AdmmParameters, /, *, emphasis: Array
+    ) -> dict[str, Any]:
+        """Arguments of `Admm` for its priors; ``emphasis`` are factors of each pattern's λ."""
+        ...
+
+    def other_lines(self, found: Patterns, /) -> Array | None:
+        """Lines of all that is no pattern, before their division by the problem's norm."""
+        ...
+
+    def other_video(self, found: Patterns, /) -> NDArray[Any] | None:
+        """Voxels of all that is no pattern."""
+        ...
+
+
+class PatternsAlone:
+    """Nothing beside the patterns: these are θ."""
+
+    share, loosens = 1.0, True
+
+    def stacked(self, found: Patterns) -> Array:
+        return found.patterns
+
+    def unstacked(self, theta: Array, found: Patterns) -> Patterns:
+        return Patterns(found.curves, theta)
+
+    def operator(self, patterns: Operator, _found: Patterns, /) -> Operator:
+        return patterns
+
+    def priors(
+        self, _found: Patterns, _basis: LearnedBasis, _parameters: AdmmParameters, /, *, emphasis: Array
+    ) -> dict[str, Any]:
+        return {"emphasis": emphasis}
+
+    def other_lines(self, _found: Patterns, /) -> None:
+        return None
+
+    def other_video(self, _found: Patterns, /) -> None:
+        return None
+
+
+PATTERNS_ALONE = PatternsAlone()
+
+
+class Refinement:
+    """Refines patterns and curves in turn: `step` is an ADMM iteration; a round ends with the curves' fit.
+
+    ``loosens`` tells whether λ is still lowered from round to round.
+    """
 
     def __init__(
         self,
-        segment: Segment,
-        problem: Problem,
+        given: Given,
         cosines: TemporalBasis,
         found: Patterns,
-        merges: tuple[int, int],
         parameters: AdmmParameters = PARAMETERS,
+        unknowns: Unknowns = PATTERNS_ALONE,
     ) -> None:
-        self.segment, self._problem, self._cosines = segment, problem, cosines
-        self._spatial_merge, self._temporal_merge = merge, temporal_merge = merges
-        self.parameters = self._first = parameters.times(self.share)
+        self._given, self._cosines, self._unknowns = given, cosines, unknowns
+        self.parameters = self._first = parameters.times(unknowns.share)
+        self.loosens = unknowns.loosens
         self._steps = 0
-        self._fit = CurveFit(segment, problem, cosines, temporal_merge, RIDGE, learns=True)
-        n = segment.geometry.size
-        # a voxel held over its pixels; the last may stand out of the picture
+        self._fit = self._new_fit()
+        n, merge = given.segment.geometry.size, given.options.spatial_merge
+        # A voxel is held over its pixels; the last may stand out of the picture.
         fine = found.patterns.repeat(merge, axis=1).repeat(merge, axis=2)[:, :n, :n]
         self._start(replace(found, patterns=fine))
 
@@ -168,30 +238,34 @@ class Refinement:
         """Begin ADMM, with the current parameters, at patterns in pixels."""
         self.found = found
         operator, basis = self._operators()
-        fine = host(found.patterns)
+        fine, start = host(found.patterns), self._theta
         size = np.sqrt(np.square(fine, dtype=np.float64).sum((1, 2)))
-        # 1e-6: of a pattern that has faded altogether the weight stays finite
+        # With 1e-6, the weight of a pattern that has faded altogether stays finite.
         emphasis = (size.max() / np.maximum(size, 1e-6 * size.max() + 1e-30)) ** FADING
-        self._admm = self._solver(operator, basis, emphasis)
-        self.found = self._at(self.found.curves)
+        self._admm = Admm(
+            operator,
+            self._given.problem.used_samples,
+            start.shape,
+            basis,
+            self.parameters,
+            start=start,
+            **self._unknowns.priors(found, basis, self.parameters, emphasis=emphasis),
+        )
+        self._take()
 
-    def _solver(self, operator: MaskedOperator, basis: LearnedBasis, emphasis: NDArray[Any]) -> Admm:
-        """ADMM from what is found."""
-        samples, start = self._problem.used_samples, self._theta
-        return Admm(operator, samples, start.shape, basis, self.parameters, start=start, emphasis=emphasis)
+    def _take(self) -> None:
+        """Take what the solver has now."""
+        self.found = self._unknowns.unstacked(self._admm.theta, self.found)
+
+    def _new_fit(self) -> CurveFit:
+        given = self._given
+        merge = given.options.temporal_merge
+        return CurveFit(given.segment, given.problem, self._cosines, merge, CURVE_DAMPING, learns=True)
 
     @property
     def _theta(self) -> Array:
         """What is found, as the solver holds it."""
-        return self.found.patterns
-
-    def _at(self, curves: NDArray[Any]) -> Patterns:
-        """What the solver has now, with these curves."""
-        return Patterns(curves, self._admm.theta)
-
-    def _known_lines(self) -> NDArray[Any] | None:
-        """Lines, as `Problem.samples`, of what the curves are not fitted to."""
-        return None
+        return self._unknowns.stacked(self.found)
 
     @property
     def rank(self) -> int:
@@ -204,14 +278,14 @@ class Refinement:
     def step(self) -> None:
         """Make one iteration. Raises NumericsError if the iterates are not finite."""
         self._admm.step()
-        self.found = self._at(self.found.curves)
+        self._take()
         self._steps += 1
         if self.at_round_end:
             self._fit_curves()
             self._admm.rebase(*self._operators(), self._theta)
-            self.found = self._at(self.found.curves)
+            self._take()
             if self.loosens:
-                weight = max(WEIGHT_DECAY * self.parameters.tv_weight, LEAST_WEIGHT * self._first.tv_weight)
+                weight = max(WEIGHT_DECAY * self.parameters.tv_weight, LAST_WEIGHT * self._first.tv_weight)
                 self._reweigh(weight)
 
     def hold(self, weight: float) -> None:
@@ -222,7 +296,7 @@ class Refinement:
     def _reweigh(self, weight: float) -> None:
         """Set λ, and lower the penalties by one step."""
         now, first = self.parameters, self._first
-        penalty = max(PENALTY_DECAY * now.tv_penalty, LEAST_PENALTY * first.tv_penalty)
+        penalty = max(PENALTY_DECAY * now.tv_penalty, LAST_PENALTY * first.tv_penalty)
         sign_penalty = first.sign_penalty * penalty / first.tv_penalty
         self.parameters = replace(now, tv_weight=weight, tv_penalty=penalty, sign_penalty=sign_penalty)
         self._admm.reweigh(self.parameters)
@@ -230,17 +304,16 @@ class Refinement:
     def return_to(self, found: Patterns) -> None:
         """Make ``found``, the result of an earlier round, the estimate."""
         self.found = found
-        # sets the operator of these curves, which `predict` needs
+        # This sets the operator of these curves, which `predict` needs.
         self._operators()
 
     def restricted(self, found: Patterns) -> Refinement:
         """A refinement that continues from here with fewer patterns, in pixels; this one stays as it is."""
         other = copy(self)
-        # from the present state: fewer patterns that start from voxels have not yet taken their light back
+        # It starts from the present state: fewer patterns that start from voxels have not yet taken their
+        # light back.
         other._start(found)
-        other._fit = CurveFit(
-            self.segment, self._problem, self._cosines, self._temporal_merge, RIDGE, learns=True
-        )
+        other._fit = other._new_fit()
         other._fit.prior = self._fit.prior
         return other
 
@@ -252,8 +325,8 @@ class Refinement:
         other = copy(self)
         other.parameters = replace(self.parameters, tv_weight=heavier * self.parameters.tv_weight)
         other._first = replace(self._first, tv_weight=heavier * self._first.tv_weight)
-        other._problem, other._steps = problem, 0
-        other._fit = CurveFit(self.segment, problem, self._cosines, self._temporal_merge, RIDGE, learns=True)
+        other._given, other._steps = replace(self._given, problem=problem), 0
+        other._fit = other._new_fit()
         other._fit.prior = self._fit.prior
         operator, basis = other._operators()
         other._admm = self._admm.with_problem(operator, problem.used_samples, heavier)
@@ -268,24 +341,24 @@ class Refinement:
         """
         found, flat = self.found, host(self.found.patterns).reshape(self.rank, -1).astype(np.float64)
         _, turn = np.linalg.eigh(flat @ flat.T)
-        # in principal axes, strongest first, the last patterns hold the least light
+        # In principal axes, strongest first, the last patterns hold the least light.
         turn = turn[:, ::-1].astype(found.curves.dtype)
 
         def strongest(count: int) -> Patterns:
             kept = turn[:, :count]
             patterns = (kept.T @ flat).reshape(-1, *found.patterns.shape[1:])
-            patterns = self._problem.arrays.asarray(patterns.astype(kept.dtype))
+            patterns = self._given.problem.arrays.asarray(patterns.astype(kept.dtype))
             return replace(found, curves=found.curves @ kept, patterns=patterns)
 
-        noise = self._problem.noise(self.segment)
+        noise = self._given.noise
         floor = noise**2 if noise < np.inf else 0.0  # NaN if it is unknown
 
         def beyond_noise() -> float:
-            return self._problem.prediction_error(self.predict()) ** 2 - floor
+            return self._given.problem.prediction_error(self.predict()) ** 2 - floor
 
         excess, needed = beyond_noise(), self.rank
         while needed > 1:
-            # only to predict with fewer: the present ones come back below
+            # This is only to predict with fewer: the present ones come back below.
             self.return_to(strongest(needed - 1))
             without = beyond_noise()
             if not without < NEEDED * excess:
@@ -296,33 +369,39 @@ class Refinement:
 
     def predict(self) -> NDArray[Any]:
         """The lines of the estimate, as `Problem.samples`."""
-        return host(self._operator.forward(self._theta)) / self._problem.norm
+        return host(self._operator.forward(self._theta)) / self._given.problem.norm
 
     def video(self) -> NDArray[Any]:
         """Dimensionless voxels (T/T_m, n/N_m, n/N_m)."""
-        merged = merge_video(host(self.found.patterns), self._spatial_merge, 1)
+        merged = merge_video(host(self.found.patterns), self._given.options.spatial_merge, 1)
         basis = LearnedBasis(self._cosines, self.found.curves)
-        return host(basis.synthesize(basis.arrays.asarray(merged)))
+        video = host(basis.synthesize(basis.arrays.asarray(merged)))
+        other = self._unknowns.other_video(self.found)
+        return video if other is None else np.asarray(video + other)
 
     def _operators(self) -> tuple[MaskedOperator, LearnedBasis]:
-        """The patterns' operator and the basis of their curves, for the present curves."""
-        basis = LearnedBasis(self._cosines, self.found.curves)
-        self._operator: Operator = segment_operator(self.segment, basis, 1, self._temporal_merge)
-        return self._problem.masked(self._operator), basis
+        """The solver's operator, and the basis of the patterns' curves, for the present curves."""
+        given, basis = self._given, LearnedBasis(self._cosines, self.found.curves)
+        patterns = segment_operator(given.segment, basis, 1, given.options.temporal_merge)
+        self._operator = self._unknowns.operator(patterns, self.found)
+        return given.problem.masked(self._operator), basis
 
     def _fit_curves(self) -> None:
         """Fit the curves to the patterns, and make them orthonormal again with the least rotation."""
-        patterns, arrays, exact = self.found.patterns, self._problem.arrays, self._problem.arrays.exact()
+        problem, patterns = self._given.problem, self.found.patterns
+        arrays, exact = problem.arrays, problem.arrays.exact()
         flat = exact.xp.reshape(exact.asarray(patterns), (self.rank, -1))
         gram = host(flat @ flat.T)
-        # the ridge keeps patterns that have become alike, or dark, from making it singular
+        # The ridge keeps patterns that have become alike, or dark, from making it singular.
         root = np.linalg.cholesky(gram + 1e-6 * np.trace(gram) * np.eye(self.rank))
-        # orthonormal patterns make the fit well conditioned; the curves take over their sizes for it
+        # Orthonormal patterns make the fit well conditioned; the curves take over their sizes for it.
         unit = arrays.xp.reshape(arrays.asarray(exact.asarray(np.linalg.inv(root)) @ flat), patterns.shape)
-        # curves of unit patterns, and then (solve) of the patterns as they were
-        fitted = self._fit(unit, self.found.curves @ root, self._known_lines())
+        other = self._unknowns.other_lines(self.found)
+        known = None if other is None else host(other) / problem.norm
+        # These are the curves of unit patterns, and then (solve) of the patterns as they were.
+        fitted = self._fit(unit, self.found.curves @ root, known)
         left, middle, right = np.linalg.svd(np.linalg.solve(root.T, fitted.T).T, full_matrices=False)
-        # left·right is the nearest orthonormal matrix; the patterns take the rest, so that Θ stays the same
+        # Left·right is the nearest orthonormal matrix; the patterns take the rest, so that Θ stays the same.
         rotated = exact.asarray((right.T * middle) @ right) @ flat
         patterns = arrays.xp.reshape(arrays.asarray(rotated), patterns.shape)
         self.found = replace(self.found, curves=(left @ right).astype(arrays.dtype), patterns=patterns)

@@ -104,7 +104,7 @@ class Problem:
         usual = HUBER * NORMAL * float(np.median(residual[self.usable]))
         if not usual > 0:
             return self
-        # equal to 1 up to `usual`, so that normal residuals keep their weight
+        # It is 1 up to `usual`, so that normal residuals keep their weight.
         weight = np.sqrt(usual / np.maximum(residual, usual)).astype(self.weight.dtype)
         return replace(self, robust_weight=weight)
 
@@ -143,7 +143,7 @@ def _relative_rms(predicted: NDArray[Any], samples: NDArray[Any], where: NDArray
     if not where.any():
         return float("nan")
     error, level = np.linalg.norm((predicted - samples)[where]), np.linalg.norm(samples[where])
-    # in darkness there is nothing to be relative to
+    # In darkness there is nothing to be relative to.
     return float(error / level) if level > 0 else float(error)
 
 
@@ -169,7 +169,7 @@ class MaskedOperator:
         if whole is None:
             return None
         xp = namespace(self.weight)
-        # with W = largest·mask: mask·(B·Bᵀ + damping/largest²)⁻¹/largest²
+        # With W = largest·mask, it is mask·(B·Bᵀ + damping/largest²)⁻¹/largest².
         largest = float(xp.max(self.weight))
         mask = xp.astype(self.weight > 0, self.weight.dtype)
         inverse = whole(damping / largest**2)
@@ -207,13 +207,14 @@ def build_problem(
         alignment=segment.alignment,
         blur=segment.blur,
     )
-    # an upper bound, within 0.3 % after five steps; power iteration ends below the norm, and TwIST diverges
+    # This is an upper bound, within 0.3 % after five steps. Power iteration ends below the norm, and TwIST
+    # diverges.
     norm = operator.norm_bound(steps=5)
     flat = operator.forward(np.ones(operator.video_shape, np.float32))
     scale = _scale(samples[usable], flat[usable])
-    # drawn by a seed, so that runs on the same lines are judged by the same samples
+    # They are drawn by a seed, so that runs on the same lines are judged by the same samples.
     held_out = held_out_blocks(usable, hold_out, seed)
-    # of very few samples none can be spared
+    # If there are very few samples, none can be spared.
     if not (usable & ~held_out).any():
         held_out = np.zeros_like(usable)
     return Problem(

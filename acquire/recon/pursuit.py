@@ -21,7 +21,8 @@ from acquire.recon.admm import Admm
 from acquire.recon.band import segment_operator
 from acquire.recon.bandwidth import FASTEST_SHARE, FEWEST_COEFFICIENTS, MARGIN
 from acquire.recon.basis import LearnedBasis, TemporalBasis, reachable, resized
-from acquire.recon.patterns import find_patterns
+from acquire.recon.cosines import begin_in_cosines
+from acquire.recon.patterns import has_clear_patterns
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -29,19 +30,15 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from acquire.arrays import Array, Arrays
-    from acquire.lines import Segment
     from acquire.recon.estimates import InBand
-    from acquire.recon.problem import Problem
-
-    Begin = Callable[[LearnedBasis, Array | None], InBand]
-    """Makes an estimate in a basis, from coefficients or from zero."""
+    from acquire.recon.given import Given
 
 NO_COSINES = np.zeros(0, np.int64)
-ROUND, ROUNDS = 10, 6
+LOOK_ITERATIONS, LOOKS = 10, 6
 """Number of iterations between two looks at the residual, and the largest number of these."""
-COARSE_SIDE = 48
+RESIDUAL_SIDE = 48
 """Voxels along a side in which the residual is looked at: a lamp covers many, and noise averages out."""
-STANDS_OUT, AT_ONCE = 5.0, 6
+MAY_BE_A_LAMP, AT_ONCE = 5.0, 6
 """Ratio to the median of the cosines not solved for above which one may be a lamp's, and the largest number
 that one look adds."""
 BESIDE = 2
@@ -56,10 +53,7 @@ not widen the band, but may still be found in the residual of the patterns."""
 
 
 def pursue(
-    segment: Segment,
-    problem: Problem,
-    merges: tuple[int, int],
-    begin: Begin,
+    given: Given,
     iterations: Callable[[InBand, int], Iterator[int]],
     fastest_lamp: Callable[[], int],
     still: Array | None = None,
@@ -70,17 +64,17 @@ def pursue(
     fastest lamp of the lines' covariance, or 0. The look starts from zero, or from the coefficients
     (1, n′, n′) of a ``still``.
     """
-    frames = segment.geometry.video_shape(*merges)[0]
-    fastest = reachable(frames, merges[1], FASTEST_SHARE)
-    # as for the search of a band: few cosines have no median that lamps could stand out of
+    frames = given.video_shape[0]
+    fastest = reachable(frames, given.options.temporal_merge, FASTEST_SHARE)
+    # As in the search of a band, few cosines have no median that lamps could stand out of.
     if fastest < 2 * FEWEST_COEFFICIENTS:
         return None
-    residual_energy = _spectrum(segment, problem, merges[1], fastest)
+    residual_energy = _spectrum(given, fastest)
     lamps, dark = NO_COSINES, np.zeros(fastest, bool)
     sure, told = NO_COSINES, None
-    look = _Look.at_start(begin, _windows(lamps, fastest), frames, problem.arrays, still)
-    for made in range(ROUNDS):
-        for _ in iterations(look.estimate, ROUND):
+    look = _Look.at_start(given, _windows(lamps, fastest), still)
+    for made in range(LOOKS):
+        for _ in iterations(look.estimate, LOOK_ITERATIONS):
             look.estimate.solver.step()
         light = look.light(lamps)
         dark[lamps[light < DARK]] = True
@@ -90,7 +84,7 @@ def pursue(
         sure = lamps[light >= max(LAMP, FAINT * light.max(initial=0))]
         if told is None and len(sure):
             told = _beyond(fastest_lamp(), sure.max(), fastest)
-        if made == ROUNDS - 1 or (len(sure) and look.is_clear):
+        if made == LOOKS - 1 or (len(sure) and has_clear_patterns(look.estimate)):
             break
         energy = residual_energy(look.estimate.predict())
         usual = np.median(np.delete(energy, look.kept))
@@ -103,37 +97,31 @@ def pursue(
         look = look.moved(_windows(np.concatenate([lamps, NO_COSINES if told is None else told]), fastest))
     if told is None or not len(sure):
         return None
-    # what is slower than a lamp costs little
+    # What is slower than a lamp costs little.
     lamps = np.concatenate([lamps[lamps <= sure.max()], told])
     return look.moved(_windows(lamps, fastest)).estimate
 
 
-def widened(look: InBand, cosine: int, begin: Begin) -> InBand:
+def widened(given: Given, look: InBand, cosine: int) -> InBand:
     """A look like this one that also holds the cosines about another."""
     kept = look.basis.held
     near = _windows(np.array([cosine]), cosine + BESIDE + 1)
-    return _Look(look, kept, begin).moved(np.union1d(kept, near)).estimate
+    return _Look(given, look, kept).moved(np.union1d(kept, near)).estimate
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Look:
-    """An estimate in the cosines ``kept``; ``begin`` makes one in any basis."""
+    """An estimate in the cosines ``kept``."""
 
+    given: Given
     estimate: InBand
     kept: NDArray[np.int64]
-    begin: Begin
 
     @classmethod
-    def at_start(
-        cls, begin: Begin, kept: NDArray[np.int64], frames: int, arrays: Arrays, still: Array | None
-    ) -> Self:
-        basis = _basis(kept, frames, arrays)
-        return cls(begin(basis, None if still is None else resized(still, basis)), kept, begin)
-
-    @property
-    def is_clear(self) -> bool:
-        """Whether the scene is evidently a sum of a few patterns."""
-        return find_patterns(host(self.estimate.solver.theta), beyond_doubt=True) is not None
+    def at_start(cls, given: Given, kept: NDArray[np.int64], still: Array | None) -> Self:
+        basis = _basis(kept, given.video_shape[0], given.problem.arrays)
+        start = None if still is None else resized(still, basis)
+        return cls(given, begin_in_cosines(given, basis, start), kept)
 
     def moved(self, wanted: NDArray[np.int64]) -> _Look:
         """The same light in other cosines, as far as these hold it."""
@@ -143,11 +131,12 @@ class _Look:
         moved = np.zeros((len(wanted), *theta.shape[1:]), theta.dtype)
         _, to, of = np.intersect1d(wanted, self.kept, return_indices=True)
         moved[to] = theta[of]
-        other = self.begin(_basis(wanted, basis.frames, basis.arrays), basis.arrays.asarray(moved))
+        start = basis.arrays.asarray(moved)
+        other = begin_in_cosines(self.given, _basis(wanted, basis.frames, basis.arrays), start)
         assert isinstance(other.solver, Admm)
         assert isinstance(self.estimate.solver, Admm)
         other.solver.adopt(self.estimate.solver)
-        return _Look(other, wanted, self.begin)
+        return _Look(self.given, other, wanted)
 
     def light(self, lamps: NDArray[np.int64]) -> NDArray[np.float64]:
         """The largest energy about each lamp, relative to that of the faster half of the slow cosines."""
@@ -188,19 +177,18 @@ def _peaks(ratio: NDArray[np.float64]) -> NDArray[np.int64]:
     """The cosines that stand out most, at least a window apart."""
     found: list[int] = []
     left = ratio.copy()
-    while len(found) < AT_ONCE and left.max() > STANDS_OUT:
+    while len(found) < AT_ONCE and left.max() > MAY_BE_A_LAMP:
         highest = int(left.argmax())
         found.append(highest)
         left[max(0, highest - BESIDE) : highest + BESIDE + 1] = 0
     return np.array(found, np.int64)
 
 
-def _spectrum(
-    segment: Segment, problem: Problem, temporal_merge: int, count: int
-) -> Callable[[NDArray[np.float64]], NDArray[np.float64]]:
+def _spectrum(given: Given, count: int) -> Callable[[NDArray[np.float64]], NDArray[np.float64]]:
     """The energy of what a prediction leaves of the samples, per cosine."""
-    frames = segment.geometry.video_shape(1, temporal_merge)[0]
-    merge = -(-segment.geometry.size // COARSE_SIDE)
+    segment, problem, temporal_merge = given.segment, given.problem, given.options.temporal_merge
+    frames = given.video_shape[0]
+    merge = -(-segment.geometry.size // RESIDUAL_SIDE)
     operator = segment_operator(segment, TemporalBasis(frames, count), merge, temporal_merge)
 
     def energy(predicted: NDArray[np.float64]) -> NDArray[np.float64]:

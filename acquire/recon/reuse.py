@@ -13,17 +13,15 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, Self
 
-from acquire.recon.blinking import EXPLAINED, first_look, refine
+from acquire.recon.blinking import AT_REST, first_look, refine
 from acquire.recon.candidates import LARGEST_WEIGHT, STILL, WEIGHT_STEP, Candidate, rounded
 from acquire.recon.cycle import FEWEST_CYCLES
 from acquire.recon.estimates import Preferred
-from acquire.recon.result import EXPLAINED as EXPLAINED_NOISE
+from acquire.recon.result import EXPLAINED
 from acquire.recon.workbench import FIRST_ITERATIONS, NEXT_ITERATIONS, SEARCH_SHARE
 
 if TYPE_CHECKING:
-    from acquire.lines import Segment
     from acquire.recon.estimates import Estimate
-    from acquire.recon.options import SolveOptions
     from acquire.recon.result import Reconstruction
     from acquire.recon.workbench import Trial, Workbench
 
@@ -31,16 +29,16 @@ AS_CLOSELY = 1.05
 """Largest held-out error in units of the noise, relative to that where the choice was made, for which it
 fits: a search takes 2 % for a gain, and errors of a few hundred blocks differ by as much as this by
 chance."""
-COSINES = "cosines"
+COSINES_PRIOR = "cosines"
 
 
 @dataclass(frozen=True, slots=True)
 class Choice:
     """What was chosen, and how well it predicted: ``error`` and ``noise`` are relative to the samples.
 
-    ``prior`` is that of a candidate, or `COSINES`, of which only the number is handed over. ``brightness`` is
-    the number of cosines of the whole scene's brightness, 0 if that is constant, ``period_frames`` that of a
-    cycle, which the next part fits to its own lines.
+    ``prior`` is that of a candidate, or `COSINES_PRIOR`, of which only the number is handed over.
+    ``brightness`` is the number of cosines of the whole scene's brightness, 0 if that is constant,
+    ``period_frames`` that of a cycle, which the next part fits to its own lines.
     """
 
     prior: str
@@ -57,14 +55,16 @@ class Choice:
     def of(cls, result: Reconstruction) -> Self | None:
         """The choice of a reconstruction; None if nothing was chosen, or if it depends on an object there."""
         found, quality = result.parameters, result.quality
-        # robust weights and a change's still are of this segment's lines
+        # Robust weights and a change's still are of this segment's lines.
         if "candidates" not in found or found.get("robust") or found.get("change"):
             return None
-        counts = [each["temporal_coefficients"] for each in found["candidates"] if each["prior"] == COSINES]
-        in_cosines, cyclic = found["prior"] == COSINES, "harmonics" in found
+        counts = [
+            each["temporal_coefficients"] for each in found["candidates"] if each["prior"] == COSINES_PRIOR
+        ]
+        in_cosines, cyclic = found["prior"] == COSINES_PRIOR, "harmonics" in found
         return cls(
             prior=found["prior"],
-            # of a cycle, the cosines up to its fastest harmonic are not what is solved for
+            # In a cycle, the cosines up to its fastest harmonic are not what is solved for.
             coefficients=2 * found["harmonics"] + 1 if cyclic else found["temporal_coefficients"],
             weight=0.0 if in_cosines else found["weight"],
             pace=0.0 if in_cosines else found["pace"],
@@ -81,7 +81,7 @@ class Choice:
         A choice that did not explain its own samples sets no looser standard than one that did.
         """
         if self.noise > 0 and noise > 0:
-            return error / noise <= AS_CLOSELY * min(self.error / self.noise, EXPLAINED_NOISE)
+            return error / noise <= AS_CLOSELY * min(self.error / self.noise, EXPLAINED)
         return error <= AS_CLOSELY * self.error
 
     def kept(self, parameters: dict[str, Any]) -> bool:
@@ -89,7 +89,10 @@ class Choice:
         same = parameters.get("prior") == self.prior
         if not same or bool(parameters.get("brightness")) != bool(self.brightness):
             return False
-        return self.prior == COSINES or (parameters["weight"], parameters["pace"]) == (self.weight, self.pace)
+        return self.prior == COSINES_PRIOR or (parameters["weight"], parameters["pace"]) == (
+            self.weight,
+            self.pace,
+        )
 
     def candidate(self, frames: int) -> Candidate:
         """The candidate to try on this many frames."""
@@ -99,24 +102,24 @@ class Choice:
         return Candidate(self.prior, cosines, self.weight, self.pace, **known)  # type: ignore[arg-type]  # not cosines
 
 
-def reuse_choice(bench: Workbench, segment: Segment, options: SolveOptions, trials: int) -> Estimate | None:
+def reuse_choice(bench: Workbench, trials: int) -> Estimate | None:
     """Solve with the choice handed over; None if it does not fit, so that everything has to be searched."""
-    choice, frames, clock = options.choice, bench.frames, bench.clock
+    choice, frames, clock = bench.given.options.choice, bench.frames, bench.clock
     assert choice is not None
-    noise, at_rest = bench.problem.noise(segment), choice.prior == STILL.prior
+    noise, at_rest = bench.given.noise, choice.prior == STILL.prior
     if at_rest:
         own = bench.with_problem(bench.problem, fine=choice.fine)
         still = own.attempt(choice.candidate(frames), FIRST_ITERATIONS)
     else:
         still = bench.attempt(bench.fitting(STILL), FIRST_ITERATIONS)
     fits = at_rest and choice.fits(still.error, noise)
-    # if noise is all that a still leaves, nothing has to move
+    # If noise is all that a still leaves, nothing has to move.
     if fits or still.error <= AS_CLOSELY * noise or clock.spent(SEARCH_SHARE):
         return bench.finish(_strengthened(still))
     if at_rest:
         return bench.finish(still.bench.climb(still, trials)) if frames == 1 else None
-    if choice.prior == COSINES:
-        return _in_cosines(bench, still, segment, options)
+    if choice.prior == COSINES_PRIOR:
+        return _in_cosines(bench, still)
     if choice.period_frames * FEWEST_CYCLES > frames:
         return None
     bright = None
@@ -126,7 +129,7 @@ def reuse_choice(bench: Workbench, segment: Segment, options: SolveOptions, tria
             return None
     moving = bench.attempt(choice.candidate(frames), FIRST_ITERATIONS, bright)
     if choice.period_frames:
-        # what was handed over had more iterations
+        # What was handed over had more iterations.
         moving = bench.follow_period(moving)
         moving = bench.attempt(moving.candidate, NEXT_ITERATIONS, moving)
     best = moving if bench.held_out.clearly_less(moving.errors, still.errors) else still
@@ -145,19 +148,20 @@ def _strengthened(best: Trial) -> Trial:
     return best
 
 
-def _in_cosines(bench: Workbench, still: Trial, segment: Segment, options: SolveOptions) -> Estimate | None:
+def _in_cosines(bench: Workbench, still: Trial) -> Estimate | None:
     """Solve in the band handed over, as `choose` does where cosines are ahead of a still."""
-    problem, clock, choice = bench.problem, bench.clock, options.choice
+    choice = bench.given.options.choice
     assert choice is not None
-    options = replace(options, bandwidth=min(1.0, choice.coefficients / bench.frames))
-    # as in `choose`: from a start at zero the code would stay in the brightness
-    start = still.admm.theta if still.error < EXPLAINED else None
-    cosines = first_look(segment, problem, options, clock, start)
-    bench.record_errors({"prior": COSINES} | cosines.facts(), cosines.predict())
-    found = refine(segment, problem, options, clock, cosines)
+    band = replace(bench.given.options, bandwidth=min(1.0, choice.coefficients / bench.frames))
+    given = replace(bench.given, options=band)
+    # As in `choose`, the code would stay in the brightness from a start at zero.
+    start = still.admm.theta if still.error < AT_REST else None
+    cosines = first_look(given, start)
+    bench.record_errors({"prior": COSINES_PRIOR} | cosines.facts(), cosines.predict())
+    found = refine(given, cosines)
     errors = bench.record_errors({"prior": "patterns"} | found.facts(), found.predict())
     ahead = bench.held_out.clearly_less(errors, still.errors)
-    if ahead and choice.fits(bench.held_out.relative(errors), problem.noise(segment)):
+    if ahead and choice.fits(bench.held_out.relative(errors), given.noise):
         return Preferred(found, bench.record)
-    clock.reset()  # the search that follows may use all of its iterations
+    given.clock.reset()  # the search that follows may use all of its iterations
     return None

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
     Floats = NDArray[np.float64]
 
-SURE = 5.0
+SIGNIFICANT = 5.0
 """Standard errors beyond which a constant light is significant."""
 CONSTANT_SHARE, CONSTANT_ERROR = 0.03, 0.012
 """Smallest constant light, relative to an arm's mean, that is reported, since less costs little; and the
@@ -52,11 +52,11 @@ def unusable(segment: Segment) -> list[Suspicion]:
         known = np.where(mask, lines, np.nan)
         seen = np.isfinite(known).any(0)
         lowest, highest = np.nanmin(known[:, seen], axis=0), np.nanmax(known[:, seen], axis=0)
-        # a single line cannot change, and darkness does not
+        # A single line cannot change, and darkness does not.
         if segment.geometry.lines == 1 or not highest.any():
             continue
         still = lowest == highest
-        # a constant column at the lowest level may be dark, and is no evidence
+        # A constant column at the lowest level may be dark, and is no evidence.
         lit = ~still | (highest > lowest.min())
         share = 1.0 if still.all() else float(still[lit].mean())
         if share > STUCK_SHARE:
@@ -104,7 +104,7 @@ def _constant(name: str, lines: Floats, model: Model, mean: float) -> list[Suspi
         words = f"arm {name} is darker than its black level on average: the black level is too high"
         return [Suspicion("black_level", words)]
     value, error = model.constant(lines)
-    if error > CONSTANT_ERROR * mean or abs(value) < max(SURE * error, CONSTANT_SHARE * mean):
+    if error > CONSTANT_ERROR * mean or abs(value) < max(SIGNIFICANT * error, CONSTANT_SHARE * mean):
         return []
     share = f"{abs(value) / mean:.0%} ± {error / mean:.0%}"
     if value < 0:
@@ -119,7 +119,7 @@ def _constant(name: str, lines: Floats, model: Model, mean: float) -> list[Suspi
 
 def _little_light(name: str, lines: Floats, model: Model, mean: float) -> list[Suspicion]:
     modes = model.modes(lines)
-    # the prior's noise is a power of ten; electrons need it more precisely
+    # The prior's noise is a power of ten; electrons need it more precisely.
     noisy = max(
         (model.with_noise(model.prior.noise * step) for step in NOISE_STEPS),
         key=lambda each: each.evidence(modes),

@@ -22,17 +22,17 @@ if TYPE_CHECKING:
 DELAYS = (0, 3, -3, 6, -6, 10, -10)
 """Delays in sub-steps to start from, equal for both arms: pictures agree a little when they are this far
 off."""
-FARTHEST = 24
+FARTHEST_DELAY = 24
 RANDOM_CODES = 4
 """Number of random codes that show the agreement by chance."""
 LEAST_CONTRAST = 10.0
 VERIFIED_ALONE, VERIFIED, BEYOND = 4.0, 2.0, 3.0
 """Agreement of the arms at which a code is verified; the second is enough if the code also explains each
 arm's own lines better than random codes do, by the third in their standard deviations."""
-DOUBTFUL = 3.0
+FOREIGN = 3.0
 """Agreement below which a code is foreign; from here to verification, nothing is claimed."""
 OTHER_SUBSTEPS = (1, 2, 3, 4, 5, 6)
-USUAL = Prior(0.06, 0.3, 3.0, 1e-2)
+USUAL_PRIOR = Prior(0.06, 0.3, 3.0, 1e-2)
 """Prior for the comparison of other S, before the best of them gets a prior that suits it."""
 APART, APART_SHARE = 15.0, 0.15
 """Log likelihood, and share of the gain, by which delays that differ between the arms must exceed a common
@@ -111,10 +111,10 @@ def inquire(model: LineModel) -> Inquiry:
     if inquiry.standing is not Standing.UNEXPLAINED:
         return inquiry
     others = [Hypothesis(substeps=each) for each in OTHER_SUBSTEPS if each != model.substeps]
-    model.prior = USUAL
+    model.prior = USUAL_PRIOR
     substeps = max(others, key=lambda each: _contrast(model, each).contrast).substeps
     other = _inquire(model, substeps)
-    # no other change is accepted with another S: with all delays to choose from, chance finds something
+    # With another S, no other change is accepted: with all delays to choose from, chance finds something.
     explained = other.best.agreement >= VERIFIED_ALONE and other.best.hypothesis.changes == 0
     if explained and other.best.gain > inquiry.best.gain + CLEAR:
         return replace(other, standing=Standing.NAMED, described=inquiry.described)
@@ -140,7 +140,7 @@ def _standing(described: Candidate, found: tuple[Candidate, ...]) -> Standing:
     best = found[0]
     if not best.verified:
         agreement = max(best.agreement, described.agreement)
-        foreign = agreement < DOUBTFUL and max(best.beyond, described.beyond) < VERIFIED_ALONE
+        foreign = agreement < FOREIGN and max(best.beyond, described.beyond) < VERIFIED_ALONE
         return Standing.UNEXPLAINED if foreign else Standing.UNCLEAR
     if best.hypothesis == described.hypothesis:
         return Standing.RIGHT
@@ -173,11 +173,12 @@ def _search(model: LineModel, plain: Hypothesis) -> tuple[Candidate, tuple[Candi
     Among candidates that are not clearly different, the one that changes least of the description is first.
     """
     model.fit_prior(plain)
-    # after the prior: agreement by chance depends on it
+    # This comes after the prior: agreement by chance depends on it.
     chance = ByChance.of(model, plain)
     described = chance.judged(_contrast(model, plain))
     found = []
-    # two: at delays three apart, or turned scenes that look alike, the right orientation may be second
+    # Two are tried: at delays three apart, or turned scenes that look alike, the right orientation may be
+    # second.
     for start in _first_look(model, plain)[:2]:
         climbed = _climb(model, start.hypothesis)
         found.append(described if climbed == plain else chance.judged(_contrast(model, climbed)))
@@ -203,7 +204,7 @@ class ByChance:
             _contrast(model, replace(plain, random_code=number)) for number in range(1, RANDOM_CODES + 1)
         ]
         own = np.array([each.evidence.own.sum() for each in found])
-        # the most that chance reached, not its mean: a code has to be clear of all of them
+        # This is the most that chance reached, not its mean: a code has to be clear of all of them.
         contrast = max(each.contrast for each in found)
         gain = max(each.gain for each in found)
         floor = LEAST_CONTRAST
@@ -212,7 +213,7 @@ class ByChance:
     def judged(self, candidate: Candidate) -> Candidate:
         """The candidate with its agreement, and its own evidence, relative to chance."""
         beyond = (float(candidate.evidence.own.sum()) - self.own) / max(self.spread, 1e-9)
-        # a scene that looks the same turned has no contrast, and yet the arms agree on it
+        # A scene that looks the same turned has no contrast, and yet the arms agree on it.
         agreement = max(candidate.contrast / self.contrast, candidate.gain / self.gain)
         return replace(candidate, agreement=agreement, beyond=beyond)
 
@@ -256,7 +257,7 @@ def _climb(model: LineModel, start: Hypothesis) -> Hypothesis:
             known[late] = float(model.evidence(replace(start, late=late)).mutual.sum())
         return known[late]
 
-    # both climbs try some of the same delays
+    # Both climbs try some of the same delays.
     known: dict[tuple[int, int], float] = {}
     common = _uphill(gain, start.late, ((3, 3), (1, 1)))
     apart = _uphill(gain, common, ((3, 0), (0, 3), (1, 0), (0, 1)))
@@ -271,7 +272,7 @@ def _uphill(
     best, improved = start, True
     while improved:
         near = [(best[0] + sign * a, best[1] + sign * b) for a, b in steps for sign in (1, -1)]
-        near = [each for each in near if max(map(abs, each)) <= FARTHEST]
+        near = [each for each in near if max(map(abs, each)) <= FARTHEST_DELAY]
         better = max(near, key=gain, default=best)
         improved = gain(better) > gain(best)
         best = better if improved else best

@@ -128,19 +128,28 @@ class Stream:
         S, T_m = self.substeps, stretch.voxels.temporal_merge
         begin, end = stretch.begin - fade_in, stretch.end + fade_out
         if self.is_slow(stretch.voxels):
-            # of the sub-steps after the last line has begun, it is the only one that sees any
+            # The last line is the only one that sees any of the sub-steps after it has begun.
             first_line = min(max(self.first_line, begin // S), self.end_line - 1)
-            # the sub-steps of a line: the last line has to end within the stretch
+            # These are the sub-steps of a line: the last line has to end within the stretch.
             exposed = self.geometry(1).span
             end_line = -(-(end - exposed) // S) + 1
         else:
             first_line = max(self.first_line, (begin - self.geometry(1).seam_substeps(T_m)) // S)
             frames = -(-(end - S * first_line) // T_m)
-            # what the first row shows in sub-step t is in line t // S, so that lines go up to the frames' end
+            # What the first row shows in sub-step t is in line t // S, so that lines go up to the frames'
+            # end.
             end_line = first_line - (-frames * T_m // S)
-        # a stretch shorter than its lines' exposure has at least one of them
+        # A stretch shorter than its lines' exposure has at least one of them.
         lines = max(1, min(self.end_line, end_line) - first_line)
-        return SubSegment(stretch.begin, stretch.end, stretch.voxels, first_line, lines, fade_in, fade_out)
+        return SubSegment(
+            stretch.begin,
+            stretch.end,
+            stretch.voxels,
+            first_line=first_line,
+            lines=lines,
+            fade_in=fade_in,
+            fade_out=fade_out,
+        )
 
     def is_slow(self, voxels: Voxels) -> bool:
         """Whether voxels are so long that every row samples them, wherever they are.
@@ -167,7 +176,7 @@ class Stream:
                 raise UsageError(
                     f"a range ends at sub-step {before.end}, but the next one begins at {after.begin}"
                 )
-        # 0 for slow ones: no seam with them fades
+        # The length is 0 for slow ones: no seam with them fades.
         lengths = [
             0 if self.is_slow(stretch.voxels) else stretch.end - stretch.begin for stretch in stretches
         ]
@@ -249,9 +258,9 @@ class Grid:
         have, want = segment.voxels.spatial_merge, self.voxels.spatial_merge
         if have == want:
             return timed
-        # the last voxel of a side may be narrower
+        # The last voxel of a side may be narrower.
         edges = [np.append(np.arange(0, self.size, merge), self.size) for merge in (have, want)]
-        # one axis after the other, since voxels are products of intervals
+        # The axes are resampled one after the other, since voxels are products of intervals.
         rows = _means(np.moveaxis(timed, 1, 0), *edges)  # (row, t, column)
         planes = _means(np.moveaxis(rows, 2, 0), *edges)  # (column, row, t)
         return np.ascontiguousarray(planes.transpose(2, 1, 0))
@@ -281,7 +290,7 @@ def _rise(edges: NDArray[np.int64], seam: int, fade: int) -> NDArray[np.float64]
 
 def _means(values: NDArray[np.float32], have: NDArray[np.int64], want: NDArray[np.int64]) -> NDArray[Any]:
     """Means over ``want[i] .. want[i+1]`` of values held over ``have[j] .. have[j+1]``, along axis 0."""
-    # a matrix with a row for each of ``want`` and a column for each of ``have``
+    # The matrix has a row for each of ``want`` and a column for each of ``have``.
     low, high = np.maximum.outer(want[:-1], have[:-1]), np.minimum.outer(want[1:], have[1:])
     overlap = np.maximum(high - low, 0).astype(np.float32)
     total = overlap.sum(axis=1, keepdims=True)
@@ -307,11 +316,11 @@ class Stitcher:
         weighted = [each * weights.reshape(-1, *[1] * (each.ndim - 1)) for each in channels]
         if self._waiting is not None:
             for channel, waiting in zip(weighted, self._waiting, strict=True):
-                # what waits begins with this sub-segment's first frame (`stop` below)
+                # What waits begins with this sub-segment's first frame (`stop` below).
                 channel[: len(waiting)] += waiting
         stop = frames.stop if following is None else self.grid.frames_of(following).start
         done = stop - frames.start
-        # copies, because views would keep whole sub-segments in memory
+        # These are copies, because views would keep whole sub-segments in memory.
         self._waiting = [channel[done:].copy() for channel in weighted]
         self.frames = stop
         return [channel[:done] for channel in weighted]

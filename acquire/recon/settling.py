@@ -21,20 +21,20 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
     from acquire.recon.clock import IterationClock
+    from acquire.recon.given import Given
     from acquire.recon.patterns import Refinement
-    from acquire.recon.problem import Problem
 
-LEAST_GAIN = 0.003
+LEAST_PROGRESS = 0.003
 """Smallest relative gain of the held-out prediction for which a round counts as an improvement."""
-LEAST_GAIN_HELD = 5e-4
-"""`LEAST_GAIN` once λ is held: next to the noise, what is still gained is small."""
+LEAST_PROGRESS_HELD = 5e-4
+"""`LEAST_PROGRESS` once λ is held: next to the noise, what is still gained is small."""
 LOOSENED_IN_VAIN, PATIENCE = 3, 6
 """Number of rounds without improvement after which λ is no longer lowered, because noise is being fitted, and
 that end a refinement."""
 TIGHTER = 2.0
 """λ from then on, relative to that of the best round, which lagged behind the λ that it was given; and the
 step to the λ that is tried next."""
-SURE = 2.0
+BEYOND_CHANCE = 2.0
 """Standard errors of the held-out RMS by which a round must be worse to count as clearly so. By as much it
 rises and falls from round to round, and of λ that predict equally well the largest fits the least noise."""
 LONG = 60
@@ -43,7 +43,7 @@ has no time for that, nor to recover from patterns that fit noise."""
 FIRST_ROUND = 20.0
 """Time that the first round may take, relative to the longest iteration of the first look. It ends with a fit
 of the curves, which may take as long as ten to twenty of these; one that ends before gains nothing."""
-CLEARLY = 0.85
+BETTER_BESIDE_MOTION = 0.85
 """Largest error of patterns beside motion, relative to that of patterns alone, for which they are preferred:
 lamps beside a dot have 0.4, lamps alone 0.9 and more."""
 ONE_MORE = 0.9
@@ -57,22 +57,22 @@ TRIAL_AFTER, TRIAL_ROUNDS = 8, 5
 must predict better: first they have to take up the light of the others."""
 
 
-def settle(refinement: Refinement, problem: Problem, clock: IterationClock) -> Refinement:
+def settle(given: Given, refinement: Refinement) -> Refinement:
     """Refine until the held-out samples are predicted no better, or the clock ends it: the best state."""
-    course = _Course(refinement, problem)
+    clock, course = given.clock, _Course(given, refinement)
     course.refine_until_idle(clock, LOOSENED_IN_VAIN, EARLY_ROUNDS * ROUND)
-    course.continue_with(_without_superfluous(course.refinement, problem, clock))
+    course.continue_with(_without_superfluous(given, course.refinement))
     if course.refine_until_idle(clock, LOOSENED_IN_VAIN, TRIAL_AFTER * ROUND):
         course.hold(course.likely_weight)
-    course.continue_with(_without_doubtful(course.refinement, problem, clock))
-    # not held yet if no noise was fitted within `TRIAL_AFTER` rounds
+    course.continue_with(_without_doubtful(given, course.refinement))
+    # λ is not held yet if no noise was fitted within `TRIAL_AFTER` rounds.
     if course.refinement.loosens and course.refine_until_idle(clock, LOOSENED_IN_VAIN):
         course.hold(course.likely_weight)
     while course.refine_until_idle(clock, PATIENCE):
-        if course.recent >= (1 - LEAST_GAIN) * course.before:
+        if course.recent >= (1 - LEAST_PROGRESS) * course.before:
             clock.converged()
             break
-        # by the used samples: the held-out ones rise and fall by more than λ changes them
+        # The used samples decide: the held-out ones rise and fall by more than λ changes them.
         step = TIGHTER if course.fits_noise else 1 / TIGHTER
         course.hold(step * course.refinement.parameters.tv_weight)
     return course.at_best()
@@ -85,14 +85,14 @@ class _Course:
     tells whether the last round met the used samples more closely than their noise allows, if it is known.
     """
 
-    def __init__(self, refinement: Refinement, problem: Problem) -> None:
-        self.refinement, self._problem = refinement, problem
-        self._noise, self.fits_noise = problem.noise(refinement.segment), False
+    def __init__(self, given: Given, refinement: Refinement) -> None:
+        self.refinement, self._problem = refinement, given.problem
+        self._noise, self.fits_noise = given.noise, False
         self.recent = self.before = np.inf
         self._best, self._kept, self._idle = np.inf, (refinement, refinement.found), 0
         self._loosened = [(np.inf, refinement.parameters.tv_weight)]
-        # an RMS of N values has a relative standard error of 1/√(2N)
-        self._doubt = SURE / np.sqrt(2 * max(1, problem.held_out.sum()))
+        # An RMS of N values has a relative standard error of 1/√(2N).
+        self._doubt = BEYOND_CHANCE / np.sqrt(2 * max(1, given.problem.held_out.sum()))
 
     def refine_until_idle(self, clock: IterationClock, patience: int, most: int | None = None) -> bool:
         """Refine until this many rounds in turn gain nothing; False if it ends before, after ``most``."""
@@ -104,11 +104,11 @@ class _Course:
                 predicted = self.refinement.predict()
                 error = self._problem.prediction_error(predicted)
                 self.fits_noise = self._problem.misfit(predicted) < self._noise
-                # without held-out samples the error is NaN, which never counts as idle
-                least_gain = LEAST_GAIN if self.refinement.loosens else LEAST_GAIN_HELD
+                # Without held-out samples the error is NaN, which never counts as idle.
+                least_gain = LEAST_PROGRESS if self.refinement.loosens else LEAST_PROGRESS_HELD
                 self._idle = self._idle + 1 if error >= (1 - least_gain) * self.recent else 0
                 self.recent = min(self.recent, error)
-                # NaN, without held-out samples, makes the last round the best
+                # A NaN, without held-out samples, makes the last round the best.
                 if not error >= self._best:
                     self._best, self._kept = error, (self.refinement, self.refinement.found)
                 if self.refinement.loosens:
@@ -142,21 +142,21 @@ class _Course:
         return refinement
 
 
-def _without_superfluous(refinement: Refinement, problem: Problem, clock: IterationClock) -> Refinement:
+def _without_superfluous(given: Given, refinement: Refinement) -> Refinement:
     """The refinement without doubtful patterns, unless a trial of equally many rounds shows them needed."""
-    fewer = _restricted(refinement)
+    fewer, clock = _restricted(refinement), given.clock
     if fewer is refinement or clock.iterations < LONG or not clock.affords(LONG * clock.mean_s):
         return fewer
-    without = _refine(fewer, EARLY_ROUNDS, problem, clock)
-    return fewer if without <= _refine(refinement, EARLY_ROUNDS, problem, clock) else refinement
+    without = early_error(given, fewer)
+    return fewer if without <= early_error(given, refinement) else refinement
 
 
-def _without_doubtful(refinement: Refinement, problem: Problem, clock: IterationClock) -> Refinement:
+def _without_doubtful(given: Given, refinement: Refinement) -> Refinement:
     """The refinement without doubtful patterns if the others soon predict the held-out samples better."""
-    error, fewer = problem.prediction_error(refinement.predict()), _restricted(refinement)
+    error, fewer = given.problem.prediction_error(refinement.predict()), _restricted(refinement)
     if fewer is refinement:
         return refinement
-    return fewer if _refine(fewer, TRIAL_ROUNDS, problem, clock) < error else refinement
+    return fewer if _refine(given, fewer, TRIAL_ROUNDS) < error else refinement
 
 
 def has_time(clock: IterationClock) -> bool:
@@ -164,14 +164,12 @@ def has_time(clock: IterationClock) -> bool:
     return clock.iterations >= LONG and clock.affords(LONG * clock.longest_s)
 
 
-def early_error(refinement: Refinement, problem: Problem, clock: IterationClock) -> float:
+def early_error(given: Given, refinement: Refinement) -> float:
     """The held-out error after the first rounds."""
-    return _refine(refinement, EARLY_ROUNDS, problem, clock)
+    return _refine(given, refinement, EARLY_ROUNDS)
 
 
-def better_than(
-    bound: float, rivals: Sequence[Callable[[], Refinement]], problem: Problem, clock: IterationClock
-) -> Refinement | None:
+def better_than(given: Given, bound: float, rivals: Sequence[Callable[[], Refinement]]) -> Refinement | None:
     """The best of refinements with more and more patterns, if its early error is below a ``bound``.
 
     The first one that does not predict clearly better than the one before it ends the search: one pattern too
@@ -180,20 +178,20 @@ def better_than(
     best, least, before = None, bound, np.inf
     for begin in rivals:
         refinement = begin()
-        error = early_error(refinement, problem, clock)
+        error = early_error(given, refinement)
         if error > ONE_MORE * before:
             break
         best, least = (refinement, error) if error < least else (best, least)
         before = error
-    clock.reset()
+    given.clock.reset()
     return best
 
 
-def _refine(refinement: Refinement, rounds: int, problem: Problem, clock: IterationClock) -> float:
+def _refine(given: Given, refinement: Refinement, rounds: int) -> float:
     """Refine for some rounds and return the held-out error."""
-    for _ in clock.run(rounds * ROUND, "refine", video=refinement.video, first=FIRST_ROUND):
+    for _ in given.clock.run(rounds * ROUND, "refine", video=refinement.video, first=FIRST_ROUND):
         refinement.step()
-    return problem.prediction_error(refinement.predict())
+    return given.problem.prediction_error(refinement.predict())
 
 
 def _restricted(refinement: Refinement) -> Refinement:

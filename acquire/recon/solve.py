@@ -19,6 +19,7 @@ from acquire.recon.basis import TemporalBasis
 from acquire.recon.cosines import find_band
 from acquire.recon.curves import CurveFit, CurveOperator
 from acquire.recon.estimates import InBand
+from acquire.recon.given import Given
 from acquire.recon.solver import Solver
 from acquire.recon.twist import Twist, TwistParameters
 
@@ -42,7 +43,7 @@ class TwistSolver(Solver):
     def solve(
         self, segment: Segment, problem: Problem, options: SolveOptions, clock: IterationClock
     ) -> Estimate:
-        return solve_twist(segment, problem, options, clock, banded=False)
+        return solve_twist(Given(segment, problem, options, clock), banded=False)
 
 
 class BandedTwistSolver(Solver):
@@ -51,20 +52,24 @@ class BandedTwistSolver(Solver):
     def solve(
         self, segment: Segment, problem: Problem, options: SolveOptions, clock: IterationClock
     ) -> Estimate:
-        return solve_twist(segment, problem, options, clock, banded=True)
+        return solve_twist(Given(segment, problem, options, clock), banded=True)
 
 
-def solve_twist(
-    segment: Segment, problem: Problem, options: SolveOptions, clock: IterationClock, *, banded: bool
-) -> Estimate:
+def solve_twist(given: Given, *, banded: bool) -> Estimate:
     """Solve with the paper's algorithm; ``banded``: in the band that the lines show."""
-    N_m, T_m = options.spatial_merge, options.temporal_merge
-    shape = segment.geometry.video_shape(N_m, T_m)
-    count = find_band(segment, problem, options, clock) if banded else shape[0]
+    segment, problem, options, shape = given.segment, given.problem, given.options, given.video_shape
+    count = find_band(given) if banded else shape[0]
     basis = TemporalBasis(shape[0], count, problem.arrays)
-    # with all cosines, the shear is less work than dense factors
+    # With all cosines, the shear is less work than dense factors.
     make = band_operator if banded else InBasis
-    operator = make(segment.geometry, segment.code, basis, N_m, T_m, segment.alignment, segment.blur)
+    operator = make(
+        segment.geometry,
+        segment.code,
+        basis,
+        *given.merges,
+        alignment=segment.alignment,
+        blur=segment.blur,
+    )
     parameters = TwistParameters()
     if options.tv_weight is not None:
         parameters = replace(parameters, tv_weight=options.tv_weight)
@@ -76,7 +81,7 @@ def solve_twist(
         basis if banded else None,
     )
     estimate = InBand(solver, operator, basis, problem, parameters)
-    for _ in clock.run(options.iterations, "solve", video=estimate.video):
+    for _ in given.clock.run(options.iterations, "solve", video=estimate.video):
         solver.step()
     return estimate
 
@@ -89,29 +94,24 @@ class KnownImage:
 
     held_out_error: float | None = None
 
-    def __init__(
-        self,
-        segment: Segment,
-        problem: Problem,
-        options: SolveOptions,
-        image: NDArray[Any],
-        clock: IterationClock,
-    ) -> None:
-        frames = segment.geometry.video_shape(options.spatial_merge, options.temporal_merge)[0]
-        self._problem = problem = problem.on_host()
+    def __init__(self, given: Given, image: NDArray[Any]) -> None:
+        segment, frames = given.segment, given.video_shape[0]
+        self._merge, temporal_merge = given.merges
+        self._problem = problem = given.problem.on_host()
         arrays = problem.arrays
-        self._image, self._merge = image.astype(arrays.dtype), options.spatial_merge
-        # no band: with the picture known, the lines determine its light up to pulses of single sub-steps
+        self._image = image.astype(arrays.dtype)
+        # There is no band: with the picture known, the lines determine its light up to pulses of single
+        # sub-steps.
         basis = TemporalBasis(frames, frames, arrays)
-        # unit norm, whatever the image's units, so that the fit's ridge means the same
+        # The norm is 1, whatever the image's units, so that the fit's ridge means the same.
         patterns = self._image[None] / np.linalg.norm(self._image)
-        self._operator = CurveOperator(segment, patterns, basis, options.temporal_merge)
+        self._operator = CurveOperator(segment, patterns, basis, temporal_merge)
         coefficients = np.zeros((frames, 1))
-        # a single iteration, but one of the clock's, so that progress and time are counted
-        for _ in clock.run(1, "light"):
-            coefficients = CurveFit(segment, problem, basis, options.temporal_merge)(patterns, coefficients)
+        # There is a single iteration, but one of the clock's, so that progress and time are counted.
+        for _ in given.clock.run(1, "light"):
+            coefficients = CurveFit(segment, problem, basis, temporal_merge)(patterns, coefficients)
         self._coefficients = arrays.asarray(coefficients)
-        seen = np.add.reduceat(segment.code, np.arange(0, len(segment.code), options.temporal_merge)) > 0
+        seen = np.add.reduceat(segment.code, np.arange(0, len(segment.code), temporal_merge)) > 0
         light = basis.synthesize(self._coefficients)[:, 0] / np.linalg.norm(self._image)
         self._light = np.interp(np.arange(frames), np.flatnonzero(seen), light[seen]).astype(arrays.dtype)
 

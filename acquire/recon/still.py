@@ -30,7 +30,7 @@ def best_still(still: Trial, trials: int, *, merge: int) -> Trial:
     """
     bench, best = still.bench, still
     if merge > 1 and not bench.clock.spent(SEARCH_SHARE):
-        # less weight than FINER_WEIGHT says: there is no model error to suppress
+        # The weight is less than FINER_WEIGHT says: there is no model error to suppress.
         weight = rounded(still.candidate.weight * merge)
         finer = replace(still.candidate, fine=True, weight=weight)
         fine = bench.with_problem(bench.problem, fine=True).attempt(finer, FIRST_ITERATIONS, still)
@@ -38,7 +38,7 @@ def best_still(still: Trial, trials: int, *, merge: int) -> Trial:
     best = best.bench.climb(best, trials)
     if bench.clock.spent(SEARCH_SHARE):
         return best
-    # after the climb: the residuals of a still that is not yet good are no outliers
+    # This comes after the climb: the residuals of a still that is not yet good are no outliers.
     robust_problem = best.bench.problem.with_robust_weights(best.bench.predict(best))
     robust_bench = best.bench.with_problem(robust_problem)
     robust = robust_bench.attempt(replace(best.candidate, robust=True), NEXT_ITERATIONS, best)

@@ -18,7 +18,7 @@ from acquire.recon.kernels import SMALLEST_WEIGHT, joint_tv_prox, tv_prox, tv_va
 if TYPE_CHECKING:
     from acquire.arrays import Array
 
-LARGEST_WEIGHT = 1e6
+FLATTENING_WEIGHT = 1e6
 """Limit of the weights, at which every frame has long been flat and 1/λ is still representable."""
 
 
@@ -52,9 +52,11 @@ class FrameTv:
         """
         xp = namespace(frames)
         capped = (
-            min(weight, LARGEST_WEIGHT) if isinstance(weight, float) else xp.minimum(weight, LARGEST_WEIGHT)
+            min(weight, FLATTENING_WEIGHT)
+            if isinstance(weight, float)
+            else xp.minimum(weight, FLATTENING_WEIGHT)
         )
-        # (K,) in the frames' dtype, whether one number was given or K
+        # (K,) in the frames' dtype, whether one number was given or K.
         weights = xp.zeros_like(frames[:, 0, 0]) + capped
         if self._dual is None:
             self._dual = xp.stack([xp.zeros_like(frames)] * 2, axis=1)
@@ -71,14 +73,15 @@ class FrameTv:
     def _prox_of_all(self, frames: Array, weights: Array) -> Array:
         """As the compiled loops; p is the dual's part along the rows' axis, q that along the columns'."""
         xp, scale = namespace(frames), weights[:, None, None]
-        # not 0, by which the dual step would be divided; the last line makes such frames the identity
+        # The weight is not 0, by which the dual step would be divided; the last line makes such frames the
+        # identity.
         used = xp.maximum(scale, SMALLEST_WEIGHT)
         step = used / (8 * (xp.max(used) if self._joint else used) ** 2)
         p, q = self._dual[:, 0, ...], self._dual[:, 1, ...]
         p_ahead, q_ahead, momentum = p, q, 1.0
         for _ in range(self.iterations):
             x = frames + used * _divergence(p_ahead, q_ahead)
-            # `ahead` is 0 at the ends, so that p and q stay 0 there, as `_divergence` requires
+            # `ahead` is 0 at the ends, so that p and q stay 0 there, as `_divergence` requires.
             new_p, new_q = p_ahead + step * ahead(x, 1), q_ahead + step * ahead(x, 2)
             length = xp.maximum(xp.sqrt(self._together(new_p**2 + new_q**2)), 1)
             new_p, new_q = new_p / length, new_q / length

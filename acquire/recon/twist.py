@@ -109,7 +109,7 @@ class Twist:
             if self._accepted(shrunk, highest):
                 return
             shrunk = self._tv.prox(target, self._lambda)  # continues from its last dual field: more exact
-        # no step was accepted: the next one starts without momentum
+        # No step was accepted: the next one starts without momentum.
         self._before = self.theta
 
     def _accepted(self, theta: Array, highest: float) -> bool:

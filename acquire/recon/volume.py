@@ -63,7 +63,8 @@ class VolumeTv:
         if self._dual is None:
             self._dual = xp.stack([xp.zeros_like(frames)] * 3)
             count = frames.shape[0]
-            # computed in float64, so that frames of float64 do not get cosines that are rounded to float32
+            # It is computed in float64, so that frames of float64 do not get cosines that are rounded to
+            # float32.
             exact = Arrays(dtype="float64")
             matrix = (
                 CyclicBasis(count, count // 2, count, exact)
@@ -103,7 +104,7 @@ class VolumeTv:
         xp, total = namespace(dual), 0.0
         for index, (axis, scale) in enumerate(_axes(scales)):
             part = dual[index, ...]
-            # the last instant of a cycle has a difference, to the first one
+            # The last instant of a cycle has a difference, to the first one.
             before = (
                 part[layer(axis, -1)] if self.cyclic and axis == 0 else xp.zeros_like(part[layer(axis, 0)])
             )
@@ -141,7 +142,8 @@ class Smooth:
         xp, weight = namespace(frames), _one(weight)
         if self._cosines is None:
             count, side, _ = frames.shape
-            # frequencies in radians per pixel; the time axis counts as long as a side, whatever its instants
+            # Frequencies are in radians per pixel; the time axis counts as long as a side, whatever its
+            # instants.
             k = np.square(np.pi * np.arange(side) / side)
             t = np.square(self.pace * np.pi * np.arange(count) / side)
             square = np.square(t[:, None, None] + k[:, None] + k)

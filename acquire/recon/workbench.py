@@ -27,12 +27,10 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from acquire.arrays import Array
-    from acquire.lines import Segment
     from acquire.recon.basis import Basis
-    from acquire.recon.clock import IterationClock
     from acquire.recon.denoisers import Denoiser
+    from acquire.recon.given import Given
     from acquire.recon.holdout import HeldOut
-    from acquire.recon.options import SolveOptions
     from acquire.recon.problem import Operator, Problem
 
 FIRST_ITERATIONS, NEXT_ITERATIONS = 30, 25
@@ -41,7 +39,7 @@ LAST_ITERATIONS = 15
 """Number of final iterations of the best candidate, with all samples."""
 SEARCH_SHARE = 0.6
 """Upper limit on the search's share of the budget."""
-LEAST_GAIN = 0.02
+GAIN_OF_WEAKER = 0.02
 """Relative gain of the prediction that a weaker prior needs to be preferred; a stronger one needs none."""
 BRIGHT_ROUNDS = 8
 """Largest number of fits of the whole scene's brightness, in turn with a volume."""
@@ -66,7 +64,7 @@ PARTS = (3, 2)
 PROBE, HOPELESS = 10, 2.5
 """Number of iterations after which a trial ends whose error is this many times that of a rival: the cosines'
 lead is 4 and more for lamps, and 1.3 to 2 for a flame or a scene that flickers as a whole."""
-STEADY = 0.03
+STEADY_BRIGHTNESS = 0.03
 """Standard deviation of a brightness that is left to the other priors."""
 
 
@@ -110,34 +108,33 @@ class Workbench:
 
     def __init__(
         self,
-        segment: Segment,
-        problem: Problem,
-        options: SolveOptions,
-        clock: IterationClock,
+        given: Given,
         held_out: HeldOut,
         shared: Shared | None = None,
         *,
         fine: bool = False,
         still: Trial | None = None,
     ) -> None:
-        self._segment, self.problem, self.clock, self.held_out = segment, problem, clock, held_out
-        self.options, self._shared = options, shared or Shared()
+        self.given, self.held_out, self._shared = given, held_out, shared or Shared()
+        self.problem, self.clock = given.problem, given.clock
         self.fine, self.still = fine, still
         self.background = None if still is None else still.coefficients
-        self._merges = (1 if fine else options.spatial_merge, options.temporal_merge)
-        self.merge = options.spatial_merge if fine else 1
-        self.frames, self._side, _ = segment.geometry.video_shape(*self._merges)
+        spatial_merge, temporal_merge = given.merges
+        self._merges = (1 if fine else spatial_merge, temporal_merge)
+        self.merge = spatial_merge if fine else 1
+        self.frames, self._side, _ = given.segment.geometry.video_shape(*self._merges)
         self._brightness: NDArray[Any] | None = None  # of the next trials; a trial keeps its own
         self._bright_cosines = self.frames
-        # successive trials mostly share one
+        # Successive trials mostly share one.
         self._operators: dict[tuple[int, bool, float], Operator] = {}
 
-        # energy of the normalised lines' response to steady light in the voxel in the middle of the picture
-        constant = TemporalBasis(self.frames, 1, problem.arrays)
+        # This is the energy of the normalised lines' response to steady light in the voxel in the middle of
+        # the picture.
+        constant = TemporalBasis(self.frames, 1, self.problem.arrays)
         point = np.zeros((1, self._side, self._side))
         point[0, self._side // 2, self._side // 2] = 1
-        lines = host(self._operator(constant, None).forward(problem.arrays.asarray(point)))
-        energy = float(np.square(lines / problem.norm, dtype=np.float64).sum()) or USUAL_ENERGY
+        lines = host(self._operator(constant, None).forward(self.problem.arrays.asarray(point)))
+        energy = float(np.square(lines / self.problem.norm, dtype=np.float64).sum()) or USUAL_ENERGY
         self._response = energy / USUAL_ENERGY
 
     @property
@@ -148,8 +145,8 @@ class Workbench:
         self, problem: Problem, *, fine: bool | None = None, still: Trial | None = None
     ) -> Workbench:
         """Another bench for the same lines: with other weights, ``fine``, or for changes from a ``still``."""
-        kept = self._segment, problem, self.options, self.clock, self.held_out, self._shared
-        return Workbench(*kept, fine=self.fine if fine is None else fine, still=still)
+        given, fine = replace(self.given, problem=problem), self.fine if fine is None else fine
+        return Workbench(given, self.held_out, self._shared, fine=fine, still=still)
 
     def merged(self, theta: Array) -> Array:
         """Coefficients of the requested voxels."""
@@ -168,12 +165,14 @@ class Workbench:
         self._fit_brightness(
             np.broadcast_to(picture, (self.frames, *picture.shape)), None, self._bright_cosines
         )
-        if self._brightness is None or self._brightness.std() < STEADY:  # its mean is 1
+        if self._brightness is None or self._brightness.std() < STEADY_BRIGHTNESS:  # its mean is 1
             return None
         best = self.probe(replace(self.fitting(CALM), brightness=True), rival)
         return self.follow_brightness(best, rival, WIDER) if best.error < HOPELESS * rival else best
 
-    def follow_brightness(self, best: Trial, rival: float = np.inf, wider: float = 1 - LEAST_GAIN) -> Trial:
+    def follow_brightness(
+        self, best: Trial, rival: float = np.inf, wider: float = 1 - GAIN_OF_WEAKER
+    ) -> Trial:
         """Fit the brightness and a volume in turn as long as this improves the prediction.
 
         When it no longer does, the brightness gets twice as many cosines: the error has to fall to ``wider``
@@ -186,7 +185,7 @@ class Workbench:
             self._fit_brightness(np.maximum(self.video(best), 0), best.brightness, cosines)
             found = self.attempt(best.candidate, NEXT_ITERATIONS, best)
             widened = cosines > self._bright_cosines
-            usual = 1 - LEAST_GAIN if found.error < rival else PURSUED
+            usual = 1 - GAIN_OF_WEAKER if found.error < rival else PURSUED
             improved = found.error < (wider if widened else usual) * best.error
             if improved or (not widened and found.error < best.error):
                 best, self._bright_cosines = found, cosines
@@ -238,13 +237,13 @@ class Workbench:
 
     def _fit_brightness(self, video: NDArray[Any], brightness: NDArray[Any] | None, cosines: int) -> None:
         """Use the brightness that a video, which has a ``brightness`` already, needs in the next trials."""
-        found = fit_brightness(self._segment, self.problem, video, self._merges, cosines)
+        found = fit_brightness(self.given.segment, self.problem, video, self._merges, cosines)
         found = found if brightness is None else found * brightness
         self._use_brightness(found / found.mean())
 
     def _use_brightness(self, brightness: NDArray[Any] | None) -> None:
         self._brightness = brightness
-        # operators that contain the former brightness are out of date
+        # Operators that contain the former brightness are out of date.
         self._operators = {key: kept for key, kept in self._operators.items() if not key[1]}
 
     def fitting(self, candidate: Candidate) -> Candidate:
@@ -273,7 +272,7 @@ class Workbench:
             denoiser=denoiser,
             background=self._background(basis),
         )
-        # multipliers and w fit only as many unknowns of the same kind
+        # Multipliers and w fit only as many unknowns of the same kind.
         if (
             start is not None
             and start.bench.fine == self.fine
@@ -344,7 +343,7 @@ class Workbench:
             return theta
         if trial.bench.fine:
             return trial.admm.theta
-        n, merge = self._side, self.options.spatial_merge
+        n, merge = self._side, self.given.options.spatial_merge
         held = host(theta).repeat(merge, axis=1).repeat(merge, axis=2)[:, :n, :n]
         return self.problem.arrays.asarray(held)
 
@@ -363,7 +362,7 @@ class Workbench:
                         return best
                     tried.add(candidate)
                     found = self.attempt(candidate, NEXT_ITERATIONS, best)
-                    gain = 0.0 if candidate.is_stronger_than(best.candidate) else LEAST_GAIN
+                    gain = 0.0 if candidate.is_stronger_than(best.candidate) else GAIN_OF_WEAKER
                     if not found.error < (1 - gain) * best.error:
                         break
                     best, improved = found, True
@@ -403,7 +402,7 @@ class Workbench:
         return self._operators[key]
 
     def _new_operator(self, brightness: NDArray[Any] | None, basis: Basis) -> Operator:
-        segment = self._segment
+        segment = self.given.segment
         code: NDArray[Any] = segment.code
         if brightness is not None:
             code = code * np.repeat(brightness, self._merges[1])[: len(code)]

@@ -30,12 +30,13 @@ def balance_of_recording(
 
     A balance in the calibration takes precedence; a warning is given if the lines contradict it.
     """
-    # as they will be solved: what a calibration and a turn of the arms leave of a difference
+    # They are taken as they will be solved: with what a calibration and a turn of the arms leave of a
+    # difference.
     segments = [as_read(each, options) for each in _sample_segments(recording)]
     found = balance_of(segments)
     if found is None:
         return None, None, ()
-    # a calibration marks the lines that it has balanced
+    # A calibration marks the lines that it has balanced.
     measured = any(each.balanced for each in segments)
     if not found.clear:
         return None, found.facts(corrected=False), ()

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 
 from acquire.cores import slowness
 from acquire.errors import UsageError
-from acquire.recon.feasibility import MARGIN, MARGIN_S, least_seconds
+from acquire.recon.feasibility import OVERRUN_S, OVERRUN_SHARE, least_seconds
 from acquire.reconstruct.work import LEAST_BUDGET_S
 
 if TYPE_CHECKING:
@@ -34,7 +34,7 @@ class Budget:
     def __init__(self, seconds: float | None, began: float, workers: int) -> None:
         self.seconds, self._began, self._workers = seconds, began, workers
         self._compiled_s = 0.0
-        # measuring it occupies a core for a few hundredths of a second
+        # Measuring it occupies a core for a few hundredths of a second.
         self._slowness = 1.0 if seconds is None else slowness()
         self._writing_s_per_voxel = WRITING_S_PER_VOXEL * self._slowness
 
@@ -68,7 +68,7 @@ class Budget:
                 known[kind] = least_seconds(few, *kind[:2], task.options.solver)
             least_s += known.get(kind, max(known.values())) + self._writing_s_per_voxel * _voxels(task)
         needed_s = self.seconds - self.left_s + least_s / self._workers
-        if needed_s > (1 + MARGIN) * self.seconds + MARGIN_S:
+        if needed_s > (1 + OVERRUN_SHARE) * self.seconds + OVERRUN_S:
             what = "this segment needs" if len(tasks) == 1 else f"these {len(tasks)} sub-segments need"
             raise UsageError(
                 f"a budget of {self.seconds:g} s cannot be kept: {what} at least {needed_s:.2g} s here",
@@ -79,9 +79,9 @@ class Budget:
         """Return the task with its deadline; ``undone`` tasks are left in all, ``after`` of them after it."""
         if self.seconds is None:
             return task
-        # what is left is divided by the number of tasks that each worker still has to do
+        # What is left is divided by the number of tasks that each worker still has to do.
         share_s = self.left_s / -(-undone // self._workers)
-        # the tasks after this one keep their shares, and its frames have to be written
+        # The tasks after this one keep their shares, and its frames have to be written.
         until_s = self.left_s - after // self._workers * share_s - self._writing_s_per_voxel * _voxels(task)
         options = replace(task.options, budget_s=max(share_s, LEAST_BUDGET_S))
         return replace(task, options=options, due=time.monotonic() + max(until_s, LEAST_BUDGET_S))
@@ -89,7 +89,7 @@ class Budget:
     def written(self, voxels: int, seconds: float, compiled_s: float) -> None:
         """Account for ``voxels`` written in ``seconds``, of a part that compiled for ``compiled_s``."""
         if voxels:
-            # at most halved, so that a single quick write does not make all others look quick
+            # It is at most halved, so that a single quick write does not make all others look quick.
             self._writing_s_per_voxel = max(seconds / voxels, self._writing_s_per_voxel / 2)
         self._compiled_s += compiled_s / self._workers  # all workers compile at the same time
 

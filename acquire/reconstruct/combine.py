@@ -39,7 +39,7 @@ if TYPE_CHECKING:
     from acquire.reconstruct.work import Options, Part
     from acquire.store import Recording
 
-LOOK_S = 0.1
+POLL_S = 0.1
 """Interval at which the waiting thread checks the progress and Ctrl-C."""
 QUALITY_KEYS = ("misfit", "prediction", "coverage", "noise")
 
@@ -82,6 +82,7 @@ def combine(
     recording: Recording,
     request: VideoRequest,
     out: Path | str,
+    *,
     options: Options,
     pool: Pool,
     watcher: Watcher,
@@ -101,13 +102,13 @@ def combine(
     options = replace(options, balance=balance)
     sharing = options.chooses and (bool(request.tiles) if options.shared is None else options.shared)
     tiles: Sequence[Tile | None] = request.tiles or (None,)
-    # the first tile makes the choice for the others
+    # The first tile makes the choice for the others.
     if sharing and len(tiles) > 1:
         tiles = liveliest_first(recording, request, options)
-    # a tile's sub-segments follow each other, because they are stitched in order of time
+    # A tile's sub-segments follow each other, because they are stitched in order of time.
     tasks = [Task(location, each, grid, options, tile=tile) for tile in tiles for each in segments]
     budget = Budget(options.budget_s, called if began is None else began, pool.workers)
-    # refused before anything is written
+    # Refused before anything is written.
     budget.check(tasks, request.stream.geometry(1))
     done: list[dict[str, Any]] = []
     with open_sheet(out, request, recording) as sheet:
@@ -126,7 +127,7 @@ def combine(
             raise KeyboardInterrupt  # there is nothing to keep
         facts = describe_parts(recording, request, done, options)
         cut = len(done) < len(tasks) and not watcher.stopped
-        # sub-segments repeat each other's warnings word for word: each once, in order
+        # Sub-segments repeat each other's warnings word for word: each is kept once, in order.
         warnings = (*warnings, *(text for part in done for text in part["warnings"]))
         facts |= {"balance": balance_facts, "warnings": list(dict.fromkeys(warnings))}
         facts["choice"] = sharing_facts(done) if sharing else None
@@ -148,9 +149,9 @@ def _solved(
     submitted = 0
     waiting: deque[Future[Part]] = deque()
     for index, task in enumerate(tasks):
-        # one more than there are workers, so that none of them waits while a part is being written
+        # There is one more than there are workers, so that none of them waits while a part is being written.
         while submitted < len(tasks) and len(waiting) <= pool.workers and not watcher.stopped:
-            # the first task always runs, because a video needs one
+            # The first task always runs, because a video needs one.
             if (submitted and budget.exhausted) or (waiting and choices.pending(tasks[submitted])):
                 break
             after = len(tasks) - submitted - 1
@@ -168,12 +169,12 @@ def _result(waiting: deque[Future[Part]], pool: Pool, watcher: Watcher) -> Part 
     """Wait for the first future and return its part; None if it was cancelled."""
     future = waiting.popleft()
     try:
-        while not wait([future], LOOK_S).done:
+        while not wait([future], POLL_S).done:
             if watcher(pool.share_done()):
                 pool.stop()
                 for each in (future, *waiting):
                     each.cancel()
-        # tasks that end sooner than `LOOK_S` are reported, too
+        # Tasks that end sooner than `POLL_S` are reported, too.
         watcher(pool.share_done())
         return future.result()
     except CancelledError:
@@ -195,10 +196,10 @@ def describe_parts(
 
     def rms(key: str) -> float | None:
         known = [part["quality"][key] for part in parts if part["quality"][key] is not None]
-        # JSON has None for what is unknown of a part, such as the noise
+        # JSON has None for what is unknown of a part, such as the noise.
         return float(np.sqrt(np.mean(np.square(known)))) if known else None
 
-    # parts may be fewer than ranges: a stop or the budget has ended the others
+    # Parts may be fewer than ranges: a stop or the budget has ended the others.
     segments = [
         {"name": name, "why": why, **part} for name, why, part in zip(names, reasons, parts, strict=False)
     ]
@@ -243,7 +244,7 @@ def _trusted_of_all_tiles(
     begin, count = segments[0].begin, len(segments)
     if request.tiles and len(parts) < count * len(request.tiles):
         return begin, begin
-    # of a tile the longest run; of all tiles what these have in common
+    # Of each tile the longest run is trusted; of all tiles, what these have in common.
     by_tile = [
         _longest_trusted([(each, part["trusted"]) for each, part in zip(segments, of_tile, strict=False)])
         for of_tile in (parts[first : first + count] for first in range(0, len(parts), count))
@@ -271,7 +272,7 @@ def _trusted_frames(request: VideoRequest, frames: int, trusted: tuple[int, int]
     T_m, begin = request.grid.voxels.temporal_merge, request.grid.begin
     low = max(request.trusted[0], trusted[0]) - begin
     high = min(request.trusted[1], trusted[1]) - begin
-    # the last frame of the grid may be shorter than T_m
+    # The last frame of the grid may be shorter than T_m.
     stop = -(-high // T_m) if begin + high >= request.grid.end else high // T_m
     first = min(frames, -(-low // T_m))
     return [first, max(first, min(frames, stop))]

@@ -58,7 +58,7 @@ def diagnose_recording(
     if calibration is not None:
         segment = calibrated(segment, calibration)
     code = code_from_attrs(recording.attrs["code"])
-    # also bits before and after the segment's: a delay moves it along the code
+    # It also gives bits before and after the segment's: a delay moves it along the code.
     begin = segment.geometry.substeps * first
 
     def bits(start: int, length: int) -> NDArray[np.uint8]:
@@ -106,7 +106,7 @@ def _with_light_check(recording: Recording, found: Diagnosis, tile: Tile | None)
     findings = judge.look(first, _sights(segment))
     shifted = all(finding.verdict is Verdict.SHIFTED for finding in findings.values())
     delays = {finding.shift for finding in findings.values()}
-    # arms with different delays are no common delay of the lines, which is all that is named here
+    # Arms with different delays are no common delay of the lines, which is all that is named here.
     if not shifted or len(delays) != 1:
         words = f"light check of {count} lines: {explain(findings, segment.geometry.substeps)}"
         return replace(found, sentence=f"{found.sentence} ({words})")
@@ -121,7 +121,7 @@ def _with_light_check(recording: Recording, found: Diagnosis, tile: Tile | None)
 
 def _sights(segment: Segment) -> dict[str, Sight]:
     """Return the mean of each line and of each column above black, per arm, over usable samples."""
-    # one level or one per arm: no calibration was applied, which would have one per column
+    # There is one level, or one per arm: no calibration was applied, which would have one per column.
     black = np.broadcast_to(np.asarray(segment.black_level_dn, float).reshape(-1), (2,))
     sights = {}
     for name, lines, mask, level in zip(ARMS, segment.lines, segment.mask, black, strict=True):

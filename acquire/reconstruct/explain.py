@@ -26,8 +26,8 @@ if TYPE_CHECKING:
     from acquire.calibrate import Calibration
     from acquire.lines import Segment
 
-ITERATIONS = 80
-MOST_LINES = 264
+TRIAL_ITERATIONS = 80
+TRIAL_LINES = 264
 OFFSETS, CURVE = ("offset_dn", "ambient_dn"), ("excess_dn",)
 LIGHT = ("shading",)
 GAINS = ("gain", *LIGHT)
@@ -70,14 +70,15 @@ def explain(
     bare = _trial(segment, merges, None)
     progress(1, total)
     bandwidth = bare.coefficients / frames
-    # once more, with the bandwidth that all trials share: the search for it would take time and vary
+    # It is solved once more, with the bandwidth that all trials share: the search for it would take time and
+    # vary.
     bare = _trial(segment, merges, bandwidth)
     whole = _trial(calibrated(segment, known), merges, bandwidth)
     progress(2, total)
     found = [Worth(NOTHING, bare.prediction, bare.seconds), Worth(ALL, whole.prediction, whole.seconds)]
     for number, (name, rest) in enumerate(parts.items()):
         left = _trial(calibrated(segment, rest), merges, bandwidth)
-        # 20: predictions are amplitudes
+        # The factor is 20, because predictions are amplitudes.
         gain_db = 20 * math.log10(left.prediction / whole.prediction)
         found.append(Worth(name, left.prediction, left.seconds, gain_db, whole.seconds / left.seconds))
         progress(number + 3, total)
@@ -92,13 +93,13 @@ class _Trial:
 
 
 def _trial(segment: Segment, merges: tuple[int, int], bandwidth: float | None) -> _Trial:
-    # no check and no estimate of the error, which would count as time of the iterations
+    # There is no check and no estimate of the error, which would count as time of the iterations.
     result = reconstruct(
-        segment, *merges, iterations=ITERATIONS, bandwidth=bandwidth, check=False, error=False
+        segment, *merges, iterations=TRIAL_ITERATIONS, bandwidth=bandwidth, check=False, error=False
     )
     coefficients = int(result.parameters.get("temporal_coefficients", 1))
-    # trials end after different numbers of iterations, so that the time of as many is compared
-    seconds = result.seconds / max(result.iterations, 1) * ITERATIONS
+    # Trials end after different numbers of iterations, so that the time of as many is compared.
+    seconds = result.seconds / max(result.iterations, 1) * TRIAL_ITERATIONS
     return _Trial(result.quality.prediction, seconds, coefficients)
 
 
@@ -118,7 +119,7 @@ def _without(known: Calibration) -> Iterator[tuple[str, Calibration]]:
     if known.orientation is not None and view_named(known.orientation) != MODEL:
         yield "the orientation", replace(known, orientation=None)
     if known.alignment is not None or known.tiles:
-        # the fall of the light needs an alignment, and is a part of its own
+        # The fall of the light needs an alignment, and is a part of its own.
         coinciding = AlignmentFound(Alignment(), {}) if belongs_to_flat(known) else None
         yield "arm B laid on arm A", replace(known, alignment=coinciding, tiles=())
     if blur_of(known) is not None:

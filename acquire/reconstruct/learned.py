@@ -61,7 +61,7 @@ def remember(found: Iterable[Learned], path: Path | None = None) -> Path:
         for each in [*recall(path), *found]
     }
     path.parent.mkdir(parents=True, exist_ok=True)
-    # renamed when complete: a program that reads meanwhile finds the old file or the new one
+    # It is renamed when complete: a program that reads meanwhile finds the old file or the new one.
     part = path.with_name(f".{path.name}.{os.getpid()}")
     document = {"version": VERSION, "learned": [asdict(each) for each in known.values()]}
     part.write_text(json.dumps(document, indent=1) + "\n", encoding="utf-8")
@@ -99,13 +99,13 @@ def choose(known: Sequence[Learned], budget_s: float, voxels: int) -> Choice:
         return Choice(
             None, f"presets were tried on {tried} ({names}), and {FEWEST_SCENES} are needed to prefer one"
         )
-    # time grows with the voxels; parts that are solved side by side end sooner, but the limit must hold
-    # on cores that others use, too
+    # Time grows with the voxels; parts that are solved side by side end sooner, but the limit must hold on
+    # cores that others use, too.
     scale = voxels / nearest
     in_time = {
         preset: fmean(tried[scene].psnr_db for scene in scenes)
         for preset, tried in by_preset.items()
-        # the slowest scene has to end in time
+        # The slowest scene has to end in time.
         if max(tried[scene].seconds for scene in scenes) * scale <= budget_s
     }
     if not in_time:

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from acquire.lines import Segment
     from acquire.store import Recording
 
-MOST_LINES = 4
+MOST_PASSES = 4
 """Upper limit on the lines of a tile that are examined, in n."""
 SPARE_LINES = 1.25
 """Least ratio of lines to unknowns of a scene at rest; below it the fit absorbs too much of the changes."""
@@ -67,8 +67,8 @@ def liveliest(
     ``read`` prepares the lines. Without ``moving``, or if nothing changes, it is the tile with most contrast.
     """
     (first, count), size = stretch, recording.geometry_for(1).size
-    most = min(count, MOST_LINES * size)
-    # the middle, and no more than 4·n lines: the fit's design grows with lines × n
+    most = min(count, MOST_PASSES * size)
+    # The middle is used, and no more than 4·n lines: the fit's design grows with lines × n.
     begin = first + (count - most) // 2
     by_tile = [energies(read(recording.cut(begin, most, tile))) for tile in tiles]
     contrast, change = (np.array(each) for each in zip(*by_tile, strict=True))
@@ -85,13 +85,13 @@ def energies(segment: Segment) -> tuple[float, float]:
     variance = segment.variance()
     unknowns = geometry.size + geometry.substeps - 1
     contrast, residual, noise = 0.0, 0.0, 0.0
-    # (line, unknown): the code that exposed each line, sub-step by sub-step
-    # a view: windows of S steps on overlap in nearly all of their bits
+    # (line, unknown): the code that exposed each line, sub-step by sub-step. It is a view, because windows
+    # that are S steps apart overlap in nearly all of their bits.
     windows = np.lib.stride_tricks.sliding_window_view(segment.code, unknowns)
     design = windows[: geometry.lines * geometry.substeps : geometry.substeps].astype(np.float64)
     for arm, (lines, mask) in enumerate(zip(samples, segment.mask, strict=True)):
         pixels = mask.mean(axis=0) > 0.5  # columns without light are masked throughout
-        # only complete lines, so that one design serves all pixels
+        # Only complete lines are used, so that one design serves all pixels.
         rows = mask[:, pixels].all(axis=1)
         good = lines[np.ix_(rows, pixels)]
         if not good.size:
@@ -102,7 +102,7 @@ def energies(segment: Segment) -> tuple[float, float]:
         if len(good) > SPARE_LINES * unknowns:
             fitted, *_ = np.linalg.lstsq(design[rows], good, rcond=None)
             unexplained = good - design[rows] @ fitted
-            # per degree of freedom: noise alone gives its variance
+            # The energy is per degree of freedom: noise alone gives its variance.
             residual += float(np.square(unexplained).sum() / ((len(good) - unknowns) * good.shape[1]))
     change = residual - noise
     return max(0.0, contrast - noise), change if change > MOVES * noise else 0.0

@@ -90,7 +90,7 @@ class _Shared:
     """State that the processes of a pool share; each gets it at its start."""
 
     def __init__(self) -> None:
-        # not a fork, which would copy locks that this process's threads hold
+        # It is not a fork, which would copy locks that this process's threads hold.
         context = multiprocessing.get_context("spawn")
         self.stop = context.Event()
         self._steps = context.Semaphore(0)  # a counter: the shared memory of a Value would outlive the pool
@@ -102,7 +102,7 @@ class _Shared:
         return self._steps.get_value() / STEPS_PER_TASK
 
     def advance(self, share: float) -> None:
-        # the remainder is kept, so that no share is lost to rounding
+        # The remainder is kept, so that no share is lost to rounding.
         steps, self._share = divmod(self._share + share * STEPS_PER_TASK, 1)
         for _ in range(int(steps)):
             self._steps.release()
@@ -116,7 +116,7 @@ class Cluster:
 
     def __init__(self, client: Any) -> None:
         self.workers = max(1, len(client.scheduler_info(n_workers=-1)["workers"]))
-        # not pure: the result of an equal task that was solved before is not reused
+        # Tasks are not pure: the result of an equal task that was solved before is not reused.
         self._executor = client.get_executor(pure=False, retries=2)
         self._lock, self._done = threading.Lock(), 0
 
@@ -165,7 +165,7 @@ def open_pool(
         return
     cores = usable_cores()
     count = min(tasks, cores if workers is None else workers)
-    # without a second process, whose start takes seconds
+    # There is no second process, whose start takes seconds.
     if count <= 1:
         with limit_threads(idle_cores()):
             yield Here(watch)
@@ -181,7 +181,7 @@ def open_pool(
             child.kill()
         raise
     finally:
-        # `shutdown` waits for the tasks in progress, which end at their next iteration
+        # `shutdown` waits for the tasks in progress, which end at their next iteration.
         shared.stop.set()
         executor.shutdown(cancel_futures=True)
 
@@ -224,17 +224,17 @@ def _begin_worker(shared: _Shared, threads: int) -> None:
     global _worker  # noqa: PLW0603  # the only place for the state that a worker process gets at its start
     import numba
 
-    # a terminal sends Ctrl-C, and its end, to all of its processes; the parent asks this one to stop
+    # A terminal sends Ctrl-C, and its end, to all of its processes; the parent asks this one to stop.
     for number in (signal.SIGINT, signal.SIGHUP):
         signal.signal(number, signal.SIG_IGN)
-    # numba refuses more threads than it was started with
+    # Numba refuses more threads than it was started with.
     numba.set_num_threads(min(threads, numba.get_num_threads()))
     limit_blas(threads)
     _worker = shared
 
 
 def _solve_in_worker(task: Task) -> Part:
-    # a function of the module, because it is sent by its name; what the processes share cannot be sent
-    # with a task
+    # This is a function of the module, because it is sent by its name. What the processes share cannot be
+    # sent with a task.
     assert _worker is not None
     return solve(task, _worker)

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 LOOKED_AT = 4
 """Length of a range that is judged separately, in n; changes are located no more precisely than that."""
-LONGEST = 12
+LONGEST_SEGMENT = 12
 """Upper limit on the length of a sub-segment, in n."""
 VOXELS_OF_A_TILE = 64
 """Voxels along a side of a tile, as in the paper's smallest scene. Without intra-line steps, voxels of S = 1
@@ -69,12 +69,12 @@ def propose(
 
     found = list(zip(stretches, _tempos(len(stretches), look, progress), strict=True))
     groups = [list(group) for _, group in groupby(found, key=lambda each: each[1].voxels)]
-    # ranges of a group that one sub-segment may hold
-    most = LONGEST // LOOKED_AT
+    # These are the ranges of a group that one sub-segment may hold.
+    most = LONGEST_SEGMENT // LOOKED_AT
     parts = [_part(group[i : i + most]) for group in groups for i in range(0, len(group), most)]
     if tile is not None:
         parts = [part.model_copy(update={"why": f"tile {tile}: {part.why}"}) for part in parts]
-    # without a length it goes to the end of the selection
+    # Without a length it goes to the end of the selection.
     last = parts.pop().model_copy(update={"substeps": None})
     return ReconstructionPlan(ends="whole" if whole else "trusted", segments=(*parts, last))
 
@@ -114,6 +114,6 @@ def _part(found: list[tuple[Stretch, Tempo]]) -> SegmentPlan:
         substeps=found[-1][0].end - found[0][0].begin,
         spatial_merge=voxels.spatial_merge,
         temporal_merge=voxels.temporal_merge,
-        # the reason of the range that was hardest to predict
+        # The reason is that of the range that was hardest to predict.
         why=max(found, key=lambda each: each[1].tried[-1][1])[1].why,
     )

@@ -157,7 +157,7 @@ def in_voxels(
     stream.geometry(1).check_merge(voxels.spatial_merge, voxels.temporal_merge)
     whole = voxels.temporal_merge >= 2 * size if whole_ends is None else whole_ends
     begin, end = selection.extent(voxels, voxels, whole=whole)
-    # of long voxels, 4·n sub-steps would be few frames
+    # For long voxels, 4·n sub-steps would be few frames.
     default = max(SPANS_PER_SEGMENT * size, VOXELS_PER_SEGMENT * voxels.temporal_merge)
     stretches = tuple(split(begin, end, voxels, default if longest is None else longest))
     return VideoRequest(stream, stretches, Grid.finest(stretches, size), _trusted(stream, begin, end))
@@ -187,7 +187,7 @@ def in_glimpses(selection: Selection, voxels: Voxels, count: int) -> VideoReques
     for stretch in stretches:
         first = (stretch.begin + stretch.end - voxels.temporal_merge) // 2
         seen = (first, first + voxels.temporal_merge)
-        # solved for the middle only; the frame then stands for the whole range
+        # It is solved for the middle only; the frame then stands for the whole range.
         glimpse = stream.sub_segment(Stretch(*seen, voxels))
         glimpses.append(replace(glimpse, begin=stretch.begin, end=stretch.end, seen=seen))
     grid = Grid.finest(stretches, stream.geometry(1).size)
@@ -209,7 +209,7 @@ def along_plan(selection: Selection, plan: ReconstructionPlan, grid: Voxels | No
     stretches, edge = [], begin
     for part, each in zip(plan.segments, voxels, strict=True):
         length = part.length_substeps(geometry.substeps, substep_s)
-        # a segment without a length takes the rest, of at least one sub-step
+        # A segment without a length takes the rest, of at least one sub-step.
         if edge + (length or 1) > end:
             wanted, most = (selection.length(to - begin) for to in (edge + (length or 1), end))
             raise UsageError(
@@ -233,6 +233,6 @@ def along_plan(selection: Selection, plan: ReconstructionPlan, grid: Voxels | No
 def _trusted(stream: Stream, begin: int, end: int) -> tuple[int, int]:
     """Return the part of ``begin`` to ``end`` that every row samples; empty if there is none."""
     origin, trusted = stream.substeps * stream.first_line, stream.geometry().trusted
-    # sub-steps are counted in the whole recording, those of a geometry from its own first line
+    # Sub-steps are counted in the whole recording, those of a geometry from its own first line.
     low, high = max(begin, origin + trusted.start), min(end, origin + trusted.stop)
     return (low, high) if high > low else (begin, begin)

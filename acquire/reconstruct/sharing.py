@@ -45,7 +45,7 @@ class SharedChoices:
 
     def record(self, task: Task, part: Part) -> None:
         """Record the choice of the first task of its kind; if it is None, every task searches."""
-        # the first: later parts may have kept it, or searched for lines that it does not fit
+        # The first counts: later parts may have kept it, or searched for lines that it does not fit.
         self._choices.setdefault(task.segment.voxels, part.choice)
 
 
@@ -62,14 +62,14 @@ def sharing_facts(parts: Sequence[dict[str, Any]]) -> dict[str, Any]:
 def liveliest_first(recording: Recording, request: VideoRequest, options: Options) -> tuple[Tile, ...]:
     """Return the tiles of a request, the one with the most activity first: see `liveliest`."""
     segments = request.sub_segments()
-    # one range for all tiles, so that their activity is comparable
+    # There is one range for all tiles, so that their activity is comparable.
     middle = segments[len(segments) // 2]
     first = liveliest(
         recording,
         request.tiles,
         (middle.first_line, middle.lines),
         lambda lines: as_read(lines, options),
-        # a single frame of all lines shows no change
+        # A single frame of all lines shows no change.
         moving=request.grid.voxels.temporal_merge < middle.lines * request.stream.substeps,
     )
     return (first, *(tile for tile in request.tiles if tile != first))

@@ -56,7 +56,7 @@ def open_sheet(out: Path | str, request: VideoRequest, recording: Recording) -> 
     anchor = (stream.substeps * stream.first_line + stream.geometry(1).readout_substep, read_out_ns)
 
     def utc_ns(first: int, stop: int) -> NDArray[np.int64]:
-        # a frame's time is its beginning
+        # A frame's time is its beginning.
         return times.utc_ns(grid.edges(slice(first, stop))[:-1], anchor)
 
     if not request.tiles:
@@ -70,7 +70,7 @@ def open_sheet(out: Path | str, request: VideoRequest, recording: Recording) -> 
         ) as writer:
             yield _Strip(writer, (grid.side, grid.side), utc_ns)
         return
-    # the corners of a rectangle, since tiles are listed row by row
+    # These are the corners of a rectangle, since tiles are listed row by row.
     first, last = request.tiles[0], request.tiles[-1]
     tiles = (last.row - first.row + 1, last.column - first.column + 1)
     with MosaicWriter(
@@ -132,6 +132,6 @@ def _video_grid(request: VideoRequest, times: Times) -> VideoGrid:
     side, begin_s = grid.voxels.spatial_merge, (grid.begin - times.first_substep) * times.substep_ns * 1e-9
     step = (times.substep_ns * grid.voxels.temporal_merge * 1e-9, float(side), float(side))
     row, column = (request.tiles[0].row, request.tiles[0].column) if request.tiles else (0, 0)
-    # positions are those of the voxels' centres
+    # Positions are those of the voxels' centres.
     middle = (side - 1) / 2
     return VideoGrid(step, (begin_s, row * grid.size + middle, column * grid.size + middle), None)

@@ -31,16 +31,16 @@ def save_reconstruction(
     provenance = describe(result, recording, segment)
     interval_ns = segment.substep_ns * float(provenance["parameters"]["temporal_merge"])
     since_ns = (segment.first_line - recording.first_line) * recording.line_period_ns
-    # after the read-out of the recording's first line, from which videos of `combine` count, too
+    # The time counts from the read-out of the recording's first line, as in videos of `combine`.
     begin_s = (since_ns + float(result.time_ns[0] - segment.time_ns[0])) * 1e-9
     centre = (spatial_merge - 1) / 2
     write_video(
         path,
         result.video,
         result.time_ns,
-        float(spatial_merge),
-        interval_ns,
-        provenance,
+        pixel_size=float(spatial_merge),
+        frame_interval_ns=interval_ns,
+        provenance=provenance,
         pixel_unit=None,
         origin=(begin_s, centre, centre),
     )

@@ -25,7 +25,7 @@ class Times:
     @classmethod
     def of(cls, recording: Recording) -> Times:
         geometry = recording.geometry_for(1)
-        # time stamps are those of read-out, n − 1 sub-steps after a line's first exposure
+        # Time stamps are those of read-out, n − 1 sub-steps after a line's first exposure.
         first = geometry.substeps * recording.first_line + geometry.readout_substep
         return cls(first, recording.line_period_ns / geometry.substeps)
 

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import time
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, field, fields, replace
+from inspect import signature
 from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
@@ -40,8 +41,9 @@ LEAST_BUDGET_S = 0.05
 
 @dataclass(frozen=True, slots=True)
 class Options:
-    """How to solve; see `acquire.recon.reconstruct`. ``budget_s`` is for the whole request.
+    """How to solve. ``budget_s`` is for the whole request.
 
+    Options that are named as parameters of `acquire.recon.reconstruct` are passed to it for each sub-segment.
     ``calibration`` corrects the lines; None leaves them to the cameras' configuration. ``turn`` is a further
     correction of the arms' orientation, for which the calibration has to be that of turned arms
     (`acquire.reconstruct.reorient`), ``balance`` the balance by which arm B's light is then divided,
@@ -72,6 +74,11 @@ class Options:
         """Whether the solver can choose prior and weight, and no option overrides its choice."""
         given = (self.bandwidth, self.denoiser)
         return "choice" in SOLVERS.load(self.solver).takes and all(each is None for each in given)
+
+    def keywords(self) -> dict[str, Any]:
+        """Return those options that `reconstruct` has as well, by its names."""
+        taken = signature(reconstruct).parameters
+        return {each.name: getattr(self, each.name) for each in fields(self) if each.name in taken}
 
 
 @dataclass(frozen=True, slots=True)
@@ -142,27 +149,20 @@ def solve(task: Task, watch: Watch) -> Part:
         watch.advance(max(0.0, share - done))
         done = max(done, share)
 
+    keywords = options.keywords()
+    if task.due is not None:
+        keywords["budget_s"] = max(task.due - time.monotonic(), LEAST_BUDGET_S)
     result = reconstruct(
         lines,
         voxels.spatial_merge,
         voxels.temporal_merge,
-        options.preset,
-        options.budget_s if task.due is None else max(task.due - time.monotonic(), LEAST_BUDGET_S),
-        advanced,
-        solver=options.solver,
-        solver_options=options.solver_options,
-        denoiser=options.denoiser,
+        progress=advanced,
         choice=task.choice,
-        iterations=options.iterations,
-        bandwidth=options.bandwidth,
-        dtype=options.dtype,
-        device=options.device,
         stop=watch,
         refuse=False,  # a task that was started ends regularly
-        check=options.check,
-        error=options.error,
+        **keywords,
     )
-    # the rest: an early end leaves part of the iterations undone
+    # The rest is reported: an early end leaves part of the iterations undone.
     watch.advance(1 - done)
     substeps = lines.geometry.substeps
     doubt = _why_not_trusted(result, segment)
@@ -196,7 +196,7 @@ def solve(task: Task, watch: Watch) -> Part:
                 for name, value in asdict(result.quality).items()
             },
         },
-        # a search that was stopped has not chosen
+        # A search that was stopped has not chosen.
         choice=Choice.of(result) if result.believed and result.ended != "stopped" else None,
     )
 
@@ -216,7 +216,7 @@ def _why_not_trusted(result: Reconstruction, segment: SubSegment) -> str | None:
     """Return why no frame is trusted, or None: the run was stopped, or too short to explain its lines."""
     if not result.believed:
         return "no frame of it is trusted: the lines contradict the recording's description of them"
-    # a run ended by its budget is trusted if it explains its lines; one that was stopped never is
+    # A run ended by its budget is trusted if it explains its lines; one that was stopped never is.
     missed = float(np.nanmax([result.quality.misfit, result.quality.prediction]))
     if result.ended != "stopped" and (result.ended != "budget" or missed <= POOR_MISFIT):
         return None

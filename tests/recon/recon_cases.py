@@ -5,6 +5,11 @@ from __future__ import annotations
 from hypothesis import strategies as st
 
 from acquire.geometry import Geometry
+from acquire.lines import Segment
+from acquire.recon.clock import IterationClock
+from acquire.recon.given import Given
+from acquire.recon.options import SolveOptions
+from acquire.recon.problem import Problem
 
 
 @st.composite
@@ -27,3 +32,16 @@ class Wall:
 
     def process_time(self) -> float:
         return self.now
+
+
+def given_for(
+    segment: Segment,
+    problem: Problem,
+    merges: tuple[int, int],
+    iterations: int = 150,
+    clock: IterationClock | None = None,
+    **options: float,
+) -> Given:
+    """What a solver is given, of a posed problem."""
+    asked = SolveOptions(*merges, solver="admm", iterations=iterations, **options)
+    return Given(segment, problem, asked, clock or IterationClock(iterations))

@@ -6,6 +6,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
+from recon_cases import given_for
 from scipy.fft import dct
 
 from acquire.evaluate.metrics import psnr
@@ -50,9 +51,8 @@ def held_against(recorded: Recorded, result: Reconstruction, clock: IterationClo
     lines = DualArm(segment.geometry, segment.code, 3, 1).forward(result.video.astype(np.float32))
     predicted = lines / (problem.norm * problem.scale)
     resolved_hz = result.parameters["resolved_hz"]
-    return detect_unresolved_light(
-        segment, problem, predicted, result.video, resolved_hz=resolved_hz, clock=clock
-    )
+    given = given_for(segment, problem, (3, 1), clock=clock)
+    return detect_unresolved_light(given, predicted, result.video, resolved_hz)
 
 
 @pytest.mark.parametrize("scene", ["still", "leds", "splash", "flame", "spark", "disc", "bullet"])

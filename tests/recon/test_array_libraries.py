@@ -7,13 +7,14 @@ the host: what passes here neither calls numpy behind the solver's back nor copi
 from __future__ import annotations
 
 import sys
+from collections.abc import Callable
 from dataclasses import replace
 
 import array_api_strict
 import numpy as np
 import pytest
 from hypothesis import given, settings
-from recon_cases import cases
+from recon_cases import cases, given_for
 
 from acquire import arrays
 from acquire.alignment import Alignment
@@ -28,7 +29,7 @@ from acquire.lines import Segment
 from acquire.recon import HaarShrink, Reconstruction, reconstruct
 from acquire.recon.band import BandOperator
 from acquire.recon.basis import TemporalBasis
-from acquire.recon.beside_motion import BesideMotion
+from acquire.recon.beside_motion import beside_motion
 from acquire.recon.patterns import ROUND, Refinement, find_patterns
 from acquire.recon.problem import build_problem
 from acquire.recon.tv import FrameTv
@@ -110,8 +111,8 @@ def test_the_band_operator_and_its_transpose(case: tuple[Geometry, int, int, int
     frames = g.video_shape(N_m, T_m)[0]
     off = Alignment(*rng.uniform(-2, 2, 2), *rng.uniform(-9, 9, 1)) if seed % 2 else None
     blur = Blur((0.7, 0.2), (1.1, 0.9), veil=(0.1, 0.02)) if seed % 4 > 1 else None
-    there = BandOperator(g, code, TemporalBasis(frames, K, STRICT), N_m, T_m, off, blur)
-    here = BandOperator(g, code, TemporalBasis(frames, K, DOUBLE), N_m, T_m, off, blur)
+    there = BandOperator(g, code, TemporalBasis(frames, K, STRICT), N_m, T_m, alignment=off, blur=blur)
+    here = BandOperator(g, code, TemporalBasis(frames, K, DOUBLE), N_m, T_m, alignment=off, blur=blur)
     theta, lines = rng.standard_normal(here.theta_shape), rng.standard_normal(g.lines_shape)
     np.testing.assert_allclose(host(there.forward(STRICT.asarray(theta))), here.forward(theta), atol=1e-11)
     np.testing.assert_allclose(host(there.adjoint(STRICT.asarray(lines))), here.adjoint(lines), atol=1e-11)
@@ -166,19 +167,19 @@ def test_every_trial_of_the_choice(device: str, scene: str, least_db: float) -> 
         assert psnr(result.video[result.trusted], given.truth(2, 1)) > least_db
 
 
-@pytest.mark.parametrize("kind", [Refinement, BesideMotion])
-def test_patterns_and_curves(segment: Segment, kind: type[Refinement]) -> None:
+@pytest.mark.parametrize("kind", [Refinement, beside_motion])
+def test_patterns_and_curves(segment: Segment, kind: Callable[..., Refinement]) -> None:
     """Two rounds from the same patterns, alone and beside a volume."""
     noise = 1e-2 * np.random.default_rng(0).standard_normal((GEOMETRY.span, 16, 16))
     theta = TemporalBasis(GEOMETRY.span, 32, DOUBLE).analyze(merge_video(scene(), 3, 1) + noise)
     found, videos = find_patterns(theta), []
     assert found is not None
-    if kind is BesideMotion:
+    if kind is beside_motion:
         found = replace(found, motion=0.1 * theta[:12])
     for where in (DOUBLE, STRICT):
         problem = build_problem(segment, 3, 1, hold_out=0.02, arrays=where)
         cosines = TemporalBasis(GEOMETRY.span, 32, where)
-        refinement = kind(segment, problem, cosines, found, (3, 1))
+        refinement = kind(given_for(segment, problem, (3, 1)), cosines, found)
         for _ in range(2 * ROUND):
             refinement.step()
         videos.append(refinement.video())

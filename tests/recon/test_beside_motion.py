@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+from typing import Any
+
 import numpy as np
 import pytest
+from recon_cases import given_for
 
 from acquire.arrays import Arrays
 from acquire.codes import prbs
@@ -14,7 +18,7 @@ from acquire.recon import blinking, reconstruct, settling
 from acquire.recon.admm import Admm, AdmmParameters
 from acquire.recon.band import band_operator
 from acquire.recon.basis import LearnedBasis, TemporalBasis
-from acquire.recon.beside_motion import BesideMotion, find_lamps
+from acquire.recon.beside_motion import beside_motion, find_lamps
 from acquire.recon.clock import IterationClock
 from acquire.recon.joined import JoinedOperator, JoinedPrior, JoinedSign, Layout
 from acquire.recon.patterns import ROUND
@@ -147,7 +151,8 @@ def test_a_refinement_keeps_both_parts_when_it_returns_continues_and_drops_a_pat
     frames = given.segment.geometry.span
     theta = TemporalBasis(frames, 40).analyze(merge_video(given.light, 2, 1) / problem.scale)
     found = find_lamps(theta, TemporalBasis(frames, 40))[0]
-    refinement = BesideMotion(given.segment, problem, TemporalBasis(frames, 40), found, (2, 1))
+    asked = given_for(given.segment, problem, (2, 1))
+    refinement = beside_motion(asked, TemporalBasis(frames, 40), found)
     for _ in range(2 * ROUND):
         refinement.step()
     kept, video, lines = refinement.found, refinement.video(), refinement.predict()
@@ -176,9 +181,10 @@ def test_a_refinement_keeps_both_parts_when_it_returns_continues_and_drops_a_pat
 def test_the_number_of_patterns_rises_as_long_as_it_pays(
     errors: tuple[float, ...], bound: float, chosen: int | None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(settling, "early_error", lambda each, *_: errors[each])
+    monkeypatch.setattr(settling, "early_error", lambda _, each: errors[each])
     rivals = [lambda each=each: each for each in range(len(errors))]
-    found = settling.better_than(bound, rivals, None, IterationClock(1))  # type: ignore[arg-type]
+    asked: Any = SimpleNamespace(clock=IterationClock(1))
+    found = settling.better_than(asked, bound, rivals)  # type: ignore[arg-type]
     assert found == chosen
 
 

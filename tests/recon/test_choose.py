@@ -9,7 +9,7 @@ from threading import Event
 import numpy as np
 import pytest
 from hypothesis import given, settings
-from recon_cases import Wall, cases
+from recon_cases import Wall, cases, given_for
 
 from acquire.alignment import Alignment
 from acquire.blur import Blur
@@ -25,7 +25,6 @@ from acquire.recon.bandwidth import light_beyond
 from acquire.recon.basis import TemporalBasis
 from acquire.recon.brightness import fit_brightness
 from acquire.recon.holdout import HeldOut
-from acquire.recon.options import SolveOptions
 from acquire.recon.problem import build_problem
 from acquire.recon.reuse import Choice
 from acquire.recon.workbench import LAST_ITERATIONS
@@ -188,10 +187,10 @@ def test_patterns_cut_short_are_not_worse_than_the_first_look(made: int) -> None
             stop.set()
 
     problem = build_problem(lines, 3, 1, hold_out=0.08)
-    options = SolveOptions(spatial_merge=3, temporal_merge=1, solver="admm", iterations=150, bandwidth=0.2)
-    progress = clock.IterationClock(150, None, watch, stop)
-    first = blinking.first_look(lines, problem, options, progress)
-    refined = blinking.refine(lines, problem, options, progress, first)
+    timed = clock.IterationClock(150, None, watch, stop)
+    asked = given_for(lines, problem, (3, 1), clock=timed, bandwidth=0.2)
+    first = blinking.first_look(asked)
+    refined = blinking.refine(asked, first)
     assert stages.count("refine") == made
     assert problem.prediction_error(refined.predict()) <= problem.prediction_error(first.predict())
 

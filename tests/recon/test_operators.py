@@ -84,7 +84,9 @@ def test_band_operator_is_the_sensing_matrix_in_the_basis(case: tuple[Geometry, 
     a, b = rng.uniform(0, 2, (2, 2)).tolist()
     veil = ((0.0, 0.0), (0.03, 0.0), (0.1, 0.2))[seed % 3]
     blur = Blur(tuple(a), tuple(b), veil=veil) if seed % 4 > 1 else None
-    band, composed = (each(g, code, basis, N_m, T_m, off, blur) for each in (BandOperator, InBasis))
+    band, composed = (
+        each(g, code, basis, N_m, T_m, alignment=off, blur=blur) for each in (BandOperator, InBasis)
+    )
     theta = rng.standard_normal(band.theta_shape)
     lines = rng.standard_normal(g.lines_shape)
     np.testing.assert_allclose(band.forward(theta), composed.forward(theta), atol=1e-11)

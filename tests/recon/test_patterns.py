@@ -8,6 +8,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from recon_cases import given_for
 
 from acquire.alignment import Alignment
 from acquire.blur import Blur
@@ -130,6 +131,7 @@ def test_light_at_cosines_that_were_not_solved_for_is_found_by_the_curves() -> N
 
 def test_a_pattern_too_many_is_recognised_and_one_of_the_scene_is_not() -> None:
     problem, cosines = build_problem(segment(), 3, 1, hold_out=0.08), TemporalBasis(GEOMETRY.span, 40)
+    asked = given_for(segment(), problem, (3, 1))
     curves, size = np.linalg.qr(cosines.analyze(LIGHT.T))
     voxels = IMAGES.reshape(2, 12, 3, 12, 3).mean((2, 4))
     scene = np.tensordot(size, voxels, 1).astype(np.float32) / problem.scale
@@ -140,7 +142,7 @@ def test_a_pattern_too_many_is_recognised_and_one_of_the_scene_is_not() -> None:
         (Patterns(curves.astype(np.float32), scene), 2),
         (Patterns(other.astype(np.float32), np.concatenate([scene, faint]).astype(np.float32)), 2),
     ):
-        refinement = Refinement(segment(), problem, cosines, found, (3, 1))
+        refinement = Refinement(asked, cosines, found)
         for _ in range(10):
             refinement.step()
         before = refinement.predict()
@@ -221,7 +223,7 @@ def test_the_patterns_total_variation_begins_with_the_noise() -> None:
         recorded = replace(clean, lines=shot.astype(np.float32), noise=noise)
         problem = build_problem(recorded, 3, 1, hold_out=0.3)
         exact = SimpleNamespace(predict=lambda: lines / (problem.scale * problem.norm))
-        return _for_noise(recorded, problem, exact).tv_weight
+        return _for_noise(given_for(recorded, problem, (3, 1)), exact).tv_weight
 
     assert weight(1e7) == weight(1e6) == PARAMETERS.tv_weight
     assert weight(1e3) > PARAMETERS.tv_weight

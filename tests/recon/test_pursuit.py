@@ -2,20 +2,22 @@
 
 from __future__ import annotations
 
-from functools import cache, partial
+from dataclasses import replace
+from functools import cache
 from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
+from recon_cases import given_for
 
 from acquire.arrays import host
 from acquire.evaluate.metrics import psnr
 from acquire.lines import Segment
-from acquire.recon import cosines, reconstruct
+from acquire.recon import cosines, pursuit, reconstruct
 from acquire.recon.bandwidth import FEWEST_COEFFICIENTS, MARGIN
 from acquire.recon.basis import LearnedBasis, TemporalBasis, reachable
-from acquire.recon.options import SolveOptions
-from acquire.recon.problem import Problem, build_problem
+from acquire.recon.given import Given
+from acquire.recon.problem import build_problem
 from acquire.recon.pursuit import pursue, widened
 from acquire.sim.procedural import record
 
@@ -24,13 +26,11 @@ if TYPE_CHECKING:
 
     from acquire.recon.estimates import InBand
 
-OPTIONS = SolveOptions(spatial_merge=3, temporal_merge=1, solver="admm", iterations=150)
-
 
 @cache
-def posed(scene: str, seed: int) -> tuple[Segment, Problem]:
+def posed(scene: str, seed: int) -> Given:
     segment = record(scene, seed, stages=32, lines=200).segment
-    return segment, build_problem(segment, 3, 1, hold_out=0.08)
+    return given_for(segment, build_problem(segment, 3, 1, hold_out=0.08), (3, 1))
 
 
 def without_limit(_: InBand, most: int) -> Iterator[int]:
@@ -38,9 +38,7 @@ def without_limit(_: InBand, most: int) -> Iterator[int]:
 
 
 def look_at(scene: str, seed: int, last_lamp: int = 0) -> InBand | None:
-    segment, problem = posed(scene, seed)
-    begin = partial(cosines.begin_in_cosines, segment, problem, OPTIONS)
-    return pursue(segment, problem, (3, 1), begin, without_limit, lambda: last_lamp)
+    return pursue(posed(scene, seed), without_limit, lambda: last_lamp)
 
 
 def kept(look: InBand) -> list[int]:
@@ -57,7 +55,7 @@ def end_of_lamps(segment: Segment) -> int:
 def test_lamps_are_found_without_the_cosines_between_them(seed: int) -> None:
     look = look_at("leds", seed)
     assert look is not None
-    last = end_of_lamps(posed("leds", seed)[0])
+    last = end_of_lamps(posed("leds", seed).segment)
     held = kept(look)
     assert {*range(FEWEST_COEFFICIENTS), last - 1, last, last + 1} <= {*held}
     assert len(held) < FEWEST_COEFFICIENTS + 25
@@ -79,38 +77,34 @@ def test_a_lamp_of_the_covariance_is_looked_at_wherever_it_is() -> None:
 
 
 def test_another_cosine_leaves_the_picture_as_it_is() -> None:
-    segment, problem = posed("leds", 61)
-    look = look_at("leds", 61)
+    leds, look = posed("leds", 61), look_at("leds", 61)
     assert look is not None
-    begin = partial(cosines.begin_in_cosines, segment, problem, OPTIONS)
-    wider = widened(look, 200, begin)
+    wider = widened(leds, look, 200)
     assert {*kept(look), 198, 199, 200, 201, 202} == {*kept(wider)}
     assert wider.basis.cosines >= 203
     np.testing.assert_allclose(wider.video(), look.video(), atol=1e-5 * look.video().max())
-    whole = cosines.begin_in_cosines(segment, problem, OPTIONS, TemporalBasis(look.basis.frames, 40), None)
+    whole = cosines.begin_in_cosines(leds, TemporalBasis(look.basis.frames, 40), None)
     whole.solver.step()
-    beyond = widened(whole, 100, begin)
+    beyond = widened(leds, whole, 100)
     assert kept(beyond) == [*range(40), *range(98, 103)]
     np.testing.assert_allclose(host(beyond.solver.theta)[:40], host(whole.solver.theta))
 
 
 def test_a_look_that_may_not_iterate_ends() -> None:
-    segment, problem = posed("leds", 61)
-    begin = partial(cosines.begin_in_cosines, segment, problem, OPTIONS)
-    assert pursue(segment, problem, (3, 1), begin, lambda *_: iter(()), lambda: 0) is None
+    assert pursue(posed("leds", 61), lambda *_: iter(()), lambda: 0) is None
 
 
-def test_a_short_video_has_no_fast_cosines_to_look_for() -> None:
-    segment, _ = posed("leds", 61)
-    T_m = segment.geometry.span // 40
-    coarse = build_problem(segment, 3, T_m, hold_out=0.08)
-    assert (
-        pursue(segment, coarse, (3, T_m), lambda *_: pytest.fail("begun"), without_limit, lambda: 0) is None
-    )
+def test_a_short_video_has_no_fast_cosines_to_look_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(pursuit, "begin_in_cosines", lambda *_: pytest.fail("begun"))
+    leds = posed("leds", 61)
+    T_m = leds.segment.geometry.span // 40
+    problem = build_problem(leds.segment, 3, T_m, hold_out=0.08)
+    coarse = replace(leds, problem=problem, options=replace(leds.options, temporal_merge=T_m))
+    assert pursue(coarse, without_limit, lambda: 0) is None
 
 
 def test_lamps_are_shown_better_and_sooner_than_in_the_whole_band() -> None:
-    segment, _ = posed("leds", 61)
+    segment = posed("leds", 61).segment
     lamps = reconstruct(segment, 3, 1, check=False, error=False)
     last = end_of_lamps(segment)
     assert lamps.parameters["patterns"] <= 5

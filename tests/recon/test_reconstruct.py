@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 
+from acquire import recon
 from acquire.codes import mix_seed, prbs
 from acquire.errors import NumericsError, UsageError
 from acquire.forward import DualArm, merge_video
@@ -221,3 +224,8 @@ def test_frame_error_is_a_residual_that_shows_unexplained_lines() -> None:
     truth = merge_video(TRUTH, 3, 1)[clean.trusted]
     error = np.linalg.norm(clean.video[clean.trusted] - truth) / np.linalg.norm(truth)
     assert 1 < error / clean.frame_error[clean.trusted].mean() < 20
+
+
+def test_the_map_of_the_room_names_all_its_modules() -> None:
+    rooms = {path.stem for path in Path(recon.__file__).parent.glob("*.py")} - {"__init__"}
+    assert rooms <= {*re.findall(r"\w+", recon.__doc__ or "")}

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from acquire.recon.settling import LOOSENED_IN_VAIN, SURE, TIGHTER, _Course
+from acquire.recon.settling import BEYOND_CHANCE, LOOSENED_IN_VAIN, TIGHTER, _Course
 
 HELD_OUT = 800
 NOISE = 1.0
@@ -23,7 +23,6 @@ class Scripted:
     loosens: bool = True
     at_round_end: bool = True
     found: object = None
-    segment: object = None
     held_at: list[float] = field(default_factory=list)
     done: int = 0
 
@@ -43,11 +42,11 @@ class Scripted:
 def course(*rounds: tuple[float, float, float], noise: float = NOISE) -> _Course:
     problem = SimpleNamespace(
         held_out=np.ones(HELD_OUT, np.bool_),
-        noise=lambda segment: noise,
         prediction_error=lambda predicted: predicted[1],
         misfit=lambda predicted: predicted[2],
     )
-    made: Any = _Course(Scripted(list(rounds)), problem)  # type: ignore[arg-type]
+    given: Any = SimpleNamespace(problem=problem, noise=noise)
+    made: Any = _Course(given, Scripted(list(rounds)))  # type: ignore[arg-type]
     clock: Any = SimpleNamespace(
         iterations=len(rounds), run=lambda most, *stage, **of_stage: range(min(most, len(rounds)))
     )
@@ -76,9 +75,9 @@ def test_three_rounds_in_vain_end_it_where_noise_is_not_fitted_or_unknown(noise:
 
 
 def test_the_largest_weight_that_predicts_as_well_is_held() -> None:
-    within = 1 + 0.9 * SURE / (2 * HELD_OUT) ** 0.5
+    within = 1 + 0.9 * BEYOND_CHANCE / (2 * HELD_OUT) ** 0.5
     found = course((8e-4, 2.0, 1.4), (4e-4, within, 1.2), (2e-4, 1.2, 1.1), (1e-4, 1.0, 1.05))
     assert found.likely_weight == 4e-4
-    beyond = 1 + 1.1 * SURE / (2 * HELD_OUT) ** 0.5
+    beyond = 1 + 1.1 * BEYOND_CHANCE / (2 * HELD_OUT) ** 0.5
     found = course((8e-4, 2.0, 1.4), (4e-4, beyond, 1.2), (2e-4, 1.2, 1.1), (1e-4, 1.0, 1.05))
     assert found.likely_weight == TIGHTER * 1e-4

@@ -40,7 +40,7 @@ def provenance(path: Path, out: Path, calibration: Calibration | None = None) ->
     tasks = len(request.stretches)
     watcher = Watcher(tasks)
     with open_pool(tasks, 1, None, watcher) as pool:
-        return combine(recording, request, out, options, pool, watcher).provenance
+        return combine(recording, request, out, options=options, pool=pool, watcher=watcher).provenance
 
 
 def test_a_balance_found_in_the_lines_is_corrected_and_reported(split: Path, tmp_path: Path) -> None:

@@ -40,7 +40,7 @@ def run(recording_path, request, path, options=QUICK, workers=1, stop=None):
     recording = open_recording(recording_path)
     watcher = Watcher(len(request.stretches), stop=stop)
     with open_pool(len(request.stretches), workers, watch=watcher) as pool:
-        return combine(recording, request, path, options, pool, watcher)
+        return combine(recording, request, path, options=options, pool=pool, watcher=watcher)
 
 
 @pytest.fixture
@@ -180,7 +180,7 @@ def test_a_budget_that_began_long_ago_is_refused_and_nothing_written(
     path, options, watcher = tmp_path / "v.zarr", Options(budget_s=20), Watcher(3)
     refused = pytest.raises(UsageError, match=r"budget of 20 s .*: these 3 sub-segments need at least 3\d s")
     with open_pool(3, 1) as pool, refused:
-        combine(recording, request_of_three, path, options, pool, watcher, began)
+        combine(recording, request_of_three, path, options=options, pool=pool, watcher=watcher, began=began)
     assert list(tmp_path.iterdir()) == []
 
 
@@ -206,7 +206,14 @@ def test_a_budget_on_a_busy_machine_keeps_the_results_so_far(recording_path, req
     recording, options = open_recording(recording_path), Options(budget_s=3.0)
     with open_pool(3, 1) as pool:
         stalled = Stalled(pool, 3.0)
-        outcome = combine(recording, request_of_three, tmp_path / "v.zarr", options, stalled, Watcher(3))
+        outcome = combine(
+            recording,
+            request_of_three,
+            tmp_path / "v.zarr",
+            options=options,
+            pool=stalled,
+            watcher=Watcher(3),
+        )
     facts = open_video(tmp_path / "v.zarr").attrs["provenance"]
     assert outcome.cut
     assert (len(facts["segments"]), facts["segments_asked"]) == (1, 3)
@@ -230,7 +237,9 @@ def test_progress_never_exceeds_the_whole_despite_trials(recording_path, tmp_pat
     watcher = Watcher(len(request.stretches), lambda done, tasks: seen.append(done / tasks))
     with open_pool(len(request.stretches), 1, watch=watcher) as pool:
         recording, options = open_recording(recording_path), Options(iterations=8)
-        outcome = combine(recording, request, tmp_path / "v.zarr", options, pool, watcher)
+        outcome = combine(
+            recording, request, tmp_path / "v.zarr", options=options, pool=pool, watcher=watcher
+        )
     assert outcome.provenance["iterations"] > outcome.provenance["iterations_asked"]
     assert seen == sorted(seen)
     assert seen[0] < 0.5

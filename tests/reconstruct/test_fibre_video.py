@@ -60,7 +60,7 @@ def combined(
     request = in_tiles(in_voxels(by_lines(recording), voxels, longest=60), tiles)
     watcher = watcher or Watcher(len(request.stretches) * len(tiles))
     with open_pool(1, watch=watcher) as pool:
-        return combine(recording, request, out, OPTIONS, pool, watcher)
+        return combine(recording, request, out, options=OPTIONS, pool=pool, watcher=watcher)
 
 
 def truth(rig: RigConfig, scene: LedSceneConfig, substeps: np.ndarray) -> np.ndarray:
@@ -99,8 +99,9 @@ def test_each_tile_searches_separately_if_requested(recording: Recording, tmp_pa
     request = in_tiles(in_voxels(by_lines(recording), Voxels(6, 153)), recording.fibre.tiles[:2])
     watcher = Watcher(2)
     with open_pool(1, watch=watcher) as pool:
+        options = replace(OPTIONS, shared=False)
         outcome = combine(
-            recording, request, tmp_path / "v.zarr", replace(OPTIONS, shared=False), pool, watcher
+            recording, request, tmp_path / "v.zarr", options=options, pool=pool, watcher=watcher
         )
     assert outcome.provenance["choice"] is None
     assert [part["kept_choice"] for part in outcome.provenance["segments"]] == [None, None]
