@@ -35,7 +35,7 @@ class WebConfig(FrozenModel):
     def _is_an_address(cls, host: str) -> str:
         # To a socket, an empty text is every address, which one should have to ask for by its name.
         if not host or host != "".join(host.split()):
-            raise ValueError("not an address; possible: 127.0.0.1, or 0.0.0.0 for every address of this host")
+            raise ValueError("it must be an address: 127.0.0.1, or 0.0.0.0 for every address of this host")
         return host
 
     @model_validator(mode="after")

@@ -234,8 +234,8 @@ def test_tokens_that_others_can_read_are_refused(tmp_path: Path) -> None:
     ("settings", "words"),
     [
         ({"host": "0.0.0.0"}, "can be reached from other hosts"),
-        ({"host": ""}, r"web\.host = '': not an address; possible: 127\.0\.0\.1, or 0\.0\.0\.0 for every"),
-        ({"host": "a b"}, "web.host = 'a b': not an address"),
+        ({"host": ""}, r"web\.host = '': it must be an address: 127\.0\.0\.1, or 0\.0\.0\.0 for every"),
+        ({"host": "a b"}, "web.host = 'a b': it must be an address"),
         ({"certificate": "c.pem"}, "must be given together"),
         ({"port": 99999}, "less than or equal to 65535"),
     ],
