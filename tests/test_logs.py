@@ -91,7 +91,10 @@ def test_a_log_that_nobody_reads_holds_up_nobody() -> None:
         "from acquire.logs import EACH, write_log\n"
         "write_log(logging.INFO); log = logging.getLogger('acquire.daemon')\n"
         "for i in range(4000): log.info('%d %s', i, 'x' * 1000, extra={'most': 10**6})\n"
-        "print('done', flush=True); input(); log.info('read again'); logging.shutdown(); log.info('last')\n"
+        "print('done', flush=True); input()\n"
+        # Until then the entries that wait leave no room for another.
+        "for i in range(20): logging.getLogger().handlers[0].flush()\n"
+        "log.info('read again'); logging.shutdown(); log.info('last')\n"
     )
     process = subprocess.Popen(
         [sys.executable, "-c", code],
