@@ -60,6 +60,24 @@ def refuse_coded(exposure: Exposure, step: str) -> None:
         )
 
 
+def refuse_constant(exposure: Exposure) -> None:
+    """Raise UsageError for lines from which no image of a target follows: their light had no code."""
+    if exposure.code_value is not None:
+        raise UsageError(
+            f"{exposure.recording} has a constant code, which does not distinguish the rows of a scene",
+            possible="a pseudo-random code: code.kind = 'prbs'",
+        )
+
+
+def refuse_fibre(exposure: Exposure) -> None:
+    """Raise UsageError for lines behind a fibre."""
+    if exposure.recording.fibre is not None:
+        raise UsageError(
+            f"{exposure.recording} cannot be used: it shows a target behind a fibre, in bands",
+            possible="a recording without a fibre",
+        )
+
+
 def refuse_lit(exposure: Exposure, found: Moments, *, covered: bool) -> list[str]:
     """Raise UsageError for dark lines that saw the light; return a warning if they may have."""
     if exposure.code_value is None and _follow_code(exposure):

@@ -26,6 +26,7 @@ from scipy.special import ndtr
 
 from acquire.calibrate.apply import calibrated
 from acquire.calibrate.calibration import Finding, Measured
+from acquire.calibrate.checks import refuse_constant, refuse_fibre
 from acquire.calibrate.still import stills
 from acquire.errors import UsageError
 from acquire.lines import ARMS
@@ -79,17 +80,8 @@ def psf(exposure: Exposure, known: Calibration) -> Finding:
 
     Raises UsageError if no edges are found, if they do not determine both axes, and for lines behind a fibre.
     """
-    recording = exposure.recording
-    if recording.fibre is not None:
-        raise UsageError(
-            f"{recording} shows a target behind a fibre: edges are not followed from band to band",
-            possible="a recording without a fibre",
-        )
-    if exposure.code_value is not None:
-        raise UsageError(
-            f"{recording} has a constant code, which does not distinguish the rows of a scene",
-            possible="a pseudo-random code: code.kind = 'prbs'",
-        )
+    refuse_fibre(exposure)
+    refuse_constant(exposure)
     lines = min(exposure.lines, MOST_LINES)
     # the images of the cameras themselves, in their own rows and columns
     plain = without_blur(replace(known, orientation=None, alignment=None))

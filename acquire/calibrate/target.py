@@ -11,6 +11,7 @@ from acquire.blur import falling
 from acquire.calibrate.align import Match, align
 from acquire.calibrate.apply import calibrated
 from acquire.calibrate.calibration import TERMS, Finding, Measured, TileAlignment
+from acquire.calibrate.checks import refuse_constant
 from acquire.calibrate.field import field_edge
 from acquire.calibrate.orientation import (
     CLEAR,
@@ -297,10 +298,6 @@ def _balance(known: Calibration, match: Match) -> dict[str, Measured]:
 
 
 def _segment(exposure: Exposure, known: Calibration) -> Segment:
-    if exposure.code_value is not None:
-        raise UsageError(
-            f"{exposure.recording} has a constant code, which does not distinguish the rows of a scene",
-            possible="a pseudo-random code: code.kind = 'prbs'",
-        )
+    refuse_constant(exposure)
     lines = min(exposure.lines, MOST_LINES)
     return calibrated(replace(exposure, lines=lines).whole(), known)

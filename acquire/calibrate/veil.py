@@ -22,6 +22,7 @@ from scipy.ndimage import uniform_filter
 from acquire.blur import MOST_VEIL
 from acquire.calibrate.apply import calibrated
 from acquire.calibrate.calibration import Finding, Measured
+from acquire.calibrate.checks import refuse_constant, refuse_fibre
 from acquire.calibrate.still import stills
 from acquire.errors import UsageError
 from acquire.lines import ARMS
@@ -57,17 +58,8 @@ def veil(exposure: Exposure, known: Calibration) -> Finding:
     Raises UsageError for a dark scene, for too much noise, for one without black parts, and for lines behind
     a fibre or with a constant code.
     """
-    recording = exposure.recording
-    if recording.fibre is not None:
-        raise UsageError(
-            f"{recording} shows a target behind a fibre, which has no image to compare with its mean",
-            possible="a recording without a fibre",
-        )
-    if exposure.code_value is not None:
-        raise UsageError(
-            f"{recording} has a constant code, which does not distinguish the rows of a scene",
-            possible="a pseudo-random code: code.kind = 'prbs'",
-        )
+    refuse_fibre(exposure)
+    refuse_constant(exposure)
     lines = min(exposure.lines, MOST_LINES)
     # the images of the cameras themselves, in their own rows and columns
     bare = replace(without_veil(known), orientation=None, alignment=None)

@@ -67,6 +67,8 @@ def test_a_dark_makes_offsets_no_veil(tmp_path: Path) -> None:
     edges = open_exposure(taken(tmp_path / "black.zarr", board(11.0), stray(0.02), current))
     first = dark(open_exposure(taken(tmp_path / "dark.zarr", board(11.0), current, kind="dark")))
     without = Calibration(edges.instrument)
+    with pytest.raises(UsageError, match="has a constant code, which does not distinguish the rows"):
+        veil(open_exposure(tmp_path / "dark.zarr"), without)
     assert "no dark was measured" in " ".join(veil(edges, without).warnings)
     found = veil(edges, without.with_step(first))
     assert not found.warnings
