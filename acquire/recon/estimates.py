@@ -9,6 +9,7 @@ import numpy as np
 
 from acquire.arrays import host
 from acquire.recon.admm import Admm
+from acquire.recon.darkness import LitPixels
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -117,10 +118,15 @@ class Refined:
         return self._refinement.video()
 
     def facts(self) -> dict[str, Any]:
-        found = {"temporal_coefficients": self._coefficients, "patterns": self._refinement.rank}
+        found: dict[str, Any] = {
+            "temporal_coefficients": self._coefficients,
+            "patterns": self._refinement.rank,
+        }
         motion = self._refinement.found.motion
         if motion is not None:
             found["motion_coefficients"] = int(motion.shape[0])
+        if isinstance(self._refinement.unknowns, LitPixels):
+            found["dark_share"] = float(1 - self._refinement.unknowns.lit.mean())
         return found | asdict(self._refinement.parameters)
 
     def continue_with(

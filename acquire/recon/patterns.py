@@ -224,7 +224,7 @@ class Refinement:
         parameters: AdmmParameters = PARAMETERS,
         unknowns: Unknowns = PATTERNS_ALONE,
     ) -> None:
-        self._given, self._cosines, self._unknowns = given, cosines, unknowns
+        self._given, self._cosines, self.unknowns = given, cosines, unknowns
         self.parameters = self._first = parameters.times(unknowns.share)
         self.loosens = unknowns.loosens
         self._steps = 0
@@ -249,13 +249,13 @@ class Refinement:
             basis,
             self.parameters,
             start=start,
-            **self._unknowns.priors(found, basis, self.parameters, emphasis=emphasis),
+            **self.unknowns.priors(found, basis, self.parameters, emphasis=emphasis),
         )
         self._take()
 
     def _take(self) -> None:
         """Take what the solver has now."""
-        self.found = self._unknowns.unstacked(self._admm.theta, self.found)
+        self.found = self.unknowns.unstacked(self._admm.theta, self.found)
 
     def _new_fit(self) -> CurveFit:
         given = self._given
@@ -265,7 +265,7 @@ class Refinement:
     @property
     def _theta(self) -> Array:
         """What is found, as the solver holds it."""
-        return self._unknowns.stacked(self.found)
+        return self.unknowns.stacked(self.found)
 
     @property
     def rank(self) -> int:
@@ -307,9 +307,13 @@ class Refinement:
         # This sets the operator of these curves, which `predict` needs.
         self._operators()
 
-    def restricted(self, found: Patterns) -> Refinement:
-        """A refinement that continues from here with fewer patterns, in pixels; this one stays as it is."""
+    def restricted(self, found: Patterns, unknowns: Unknowns | None = None) -> Refinement:
+        """A refinement that continues from here with fewer patterns, in pixels, or with other unknowns.
+
+        This one stays as it is.
+        """
         other = copy(self)
+        other.unknowns = unknowns or self.unknowns
         # It starts from the present state: fewer patterns that start from voxels have not yet taken their
         # light back.
         other._start(found)
@@ -371,19 +375,23 @@ class Refinement:
         """The lines of the estimate, as `Problem.samples`."""
         return host(self._operator.forward(self._theta)) / self._given.problem.norm
 
+    def taken_back(self, lines: NDArray[Any]) -> NDArray[Any]:
+        """Bᵀ of lines (2, L_R, M): in each pattern (R, n, n), the light that they come from."""
+        return host(self._in_patterns.adjoint(self._given.problem.arrays.asarray(lines)))
+
     def video(self) -> NDArray[Any]:
         """Dimensionless voxels (T/T_m, n/N_m, n/N_m)."""
         merged = merge_video(host(self.found.patterns), self._given.options.spatial_merge, 1)
         basis = LearnedBasis(self._cosines, self.found.curves)
         video = host(basis.synthesize(basis.arrays.asarray(merged)))
-        other = self._unknowns.other_video(self.found)
+        other = self.unknowns.other_video(self.found)
         return video if other is None else np.asarray(video + other)
 
     def _operators(self) -> tuple[MaskedOperator, LearnedBasis]:
         """The solver's operator, and the basis of the patterns' curves, for the present curves."""
         given, basis = self._given, LearnedBasis(self._cosines, self.found.curves)
-        patterns = segment_operator(given.segment, basis, 1, given.options.temporal_merge)
-        self._operator = self._unknowns.operator(patterns, self.found)
+        self._in_patterns = segment_operator(given.segment, basis, 1, given.options.temporal_merge)
+        self._operator = self.unknowns.operator(self._in_patterns, self.found)
         return given.problem.masked(self._operator), basis
 
     def _fit_curves(self) -> None:
@@ -396,7 +404,7 @@ class Refinement:
         root = np.linalg.cholesky(gram + 1e-6 * np.trace(gram) * np.eye(self.rank))
         # Orthonormal patterns make the fit well conditioned; the curves take over their sizes for it.
         unit = arrays.xp.reshape(arrays.asarray(exact.asarray(np.linalg.inv(root)) @ flat), patterns.shape)
-        other = self._unknowns.other_lines(self.found)
+        other = self.unknowns.other_lines(self.found)
         known = None if other is None else host(other) / problem.norm
         # These are the curves of unit patterns, and then (solve) of the patterns as they were.
         fitted = self._fit(unit, self.found.curves @ root, known)

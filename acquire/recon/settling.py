@@ -1,6 +1,7 @@
 """The refinement of patterns and curves from its first round to its last.
 
-    doubtful patterns on trial ─▶ λ is lowered until noise is fitted ─▶ those left on trial ─▶ λ is held
+    doubtful patterns and a dark ground on trial ─▶ λ is lowered until noise is fitted ─▶ both once more
+    ─▶ λ is held
 
 The first look distinguishes patterns from its own errors only by energy, and may find too many. Superfluous
 ones fit noise: the picture loses 2 to 10 dB while the lines are explained. The held-out samples end the
@@ -15,6 +16,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from acquire.recon.darkness import gains_darkness, in_pixels, lit_pixels, with_light_missing
 from acquire.recon.patterns import ROUND
 
 if TYPE_CHECKING:
@@ -56,18 +58,24 @@ TRIAL_AFTER, TRIAL_ROUNDS = 8, 5
 """Number of rounds before the second trial if no noise is fitted, and those of the fewer patterns until they
 must predict better: first they have to take up the light of the others."""
 
+DARK_ROUNDS, DARK_TRIALS = 3, 2
+"""Number of rounds on a dark ground after which the lines show light that is missing, and of times that the
+pixels with such light are lit."""
+
 
 def settle(given: Given, refinement: Refinement) -> Refinement:
     """Refine until the held-out samples are predicted no better, or the clock ends it: the best state."""
     clock, course = given.clock, _Course(given, refinement)
     course.refine_until_idle(clock, LOOSENED_IN_VAIN, EARLY_ROUNDS * ROUND)
     course.continue_with(_without_superfluous(given, course.refinement))
+    course.try_dark_ground()
     if course.refine_until_idle(clock, LOOSENED_IN_VAIN, TRIAL_AFTER * ROUND):
         course.hold(course.likely_weight)
     course.continue_with(_without_doubtful(given, course.refinement))
     # λ is not held yet if no noise was fitted within `TRIAL_AFTER` rounds.
     if course.refinement.loosens and course.refine_until_idle(clock, LOOSENED_IN_VAIN):
         course.hold(course.likely_weight)
+    course.try_dark_ground()
     while course.refine_until_idle(clock, PATIENCE):
         if course.recent >= (1 - LEAST_PROGRESS) * course.before:
             clock.converged()
@@ -86,7 +94,7 @@ class _Course:
     """
 
     def __init__(self, given: Given, refinement: Refinement) -> None:
-        self.refinement, self._problem = refinement, given.problem
+        self.refinement, self._given, self._problem = refinement, given, given.problem
         self._noise, self.fits_noise = given.noise, False
         self.recent = self.before = np.inf
         self._best, self._kept, self._idle = np.inf, (refinement, refinement.found), 0
@@ -135,6 +143,14 @@ class _Course:
         if refinement is not self.refinement:
             self.refinement, self.recent, self._idle = refinement, np.inf, 0
 
+    def try_dark_ground(self) -> None:
+        """Continue with a dark ground, whose state is the best from now on, if it predicts well enough."""
+        refinement = _on_dark_ground(self._given, self.refinement, (1 + self._doubt) * self._best)
+        if refinement is not self.refinement:
+            self.continue_with(refinement)
+            self._best = self._problem.prediction_error(refinement.predict())
+            self._kept = refinement, refinement.found
+
     def at_best(self) -> Refinement:
         """The refinement, returned to its best round."""
         refinement, found = self._kept
@@ -157,6 +173,28 @@ def _without_doubtful(given: Given, refinement: Refinement) -> Refinement:
     if fewer is refinement:
         return refinement
     return fewer if _refine(given, fewer, TRIAL_ROUNDS) < error else refinement
+
+
+def _on_dark_ground(given: Given, refinement: Refinement, enough: float) -> Refinement:
+    """The refinement with a dark ground beside the lamps, if its held-out error soon is ``enough``.
+
+    What is enough is no gain: noise that is free to be light predicts as well, and takes from the lamps.
+    """
+    clock, dark, lit = given.clock, refinement, lit_pixels(refinement.found)
+    for _ in range(DARK_TRIALS):
+        affordable = not clock.spent(1) and clock.affords(DARK_ROUNDS * ROUND * clock.mean_s)
+        if not (affordable and gains_darkness(refinement.unknowns, lit)):
+            break
+        dark = dark.restricted(dark.found, in_pixels(given, refinement.unknowns, lit))
+        dark.loosens = False
+        error, held = _refine(given, dark, DARK_ROUNDS), lit
+        lit = with_light_missing(given, dark, held)
+        if error <= enough:
+            if not np.array_equal(lit, held):
+                dark = dark.restricted(dark.found, in_pixels(given, refinement.unknowns, lit))
+            dark.loosens = refinement.loosens
+            return dark
+    return refinement
 
 
 def has_time(clock: IterationClock) -> bool:
