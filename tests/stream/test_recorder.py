@@ -86,7 +86,13 @@ class Bed:
         self.disk = SlowDisk()
         plan = RecorderPlan(RUN, STAGES, stall_timeout_s=60.0, tag_wait_s=0.0, max_skew_lines=10_000)
         self.recorder = Recorder(
-            self.post, plan, self.rings, self.tags, self.counters, self.disk, ExternalCounts({})
+            self.post,
+            plan,
+            self.rings,
+            tags=self.tags,
+            counters=self.counters,
+            disk=self.disk,
+            external=ExternalCounts({}),
         )
         self.post.waiting.append(RunStarted(ClockFit(90_000_000, 0, 0)))
         self.line = 0
