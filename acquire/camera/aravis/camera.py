@@ -37,7 +37,9 @@ if TYPE_CHECKING:
 FAKE = "Fake"
 """Interface of Aravis' own camera, for tests; off unless the spec's ``cti`` asks for it."""
 _ALIVE_S = 0.5
+"""How often a silent camera is checked."""
 _SUCCESS, _ABORTED = 0, 7
+"""Of ArvBufferStatus."""
 _NO_ID = 2**64 - 1
 """Set in a buffer before it is filled. Only the first packet of a frame carries its number: without this, a
 buffer whose frame lost that packet would still have the number of the previous frame."""
@@ -68,6 +70,7 @@ class AravisCamera:
         self._armed = False
         self._assembly: Assembly | None = None
         self._taken: set[int] = set()
+        """Buffers that Aravis does not own: taken from its stream, and not yet queued again."""
         self._payload = 0
         self._camera: int | None = None
         device_id = spec.cti.encode() if spec.cti not in ("", FAKE) else _find(library, spec)
