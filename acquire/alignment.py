@@ -77,7 +77,8 @@ class Alignment:
             return found
         k, aim = self.distortion / half**2, np.hypot(*found)
         if k > 0:
-            # beyond this distance nothing is imaged
+            # q = r·(1 − k·r²) is at most 2/3/√(3k), at r = 1/√(3k): beyond this distance nothing is imaged,
+            # and at it the step below would divide by 0.
             aim = np.minimum(aim, 0.999 * 2 / 3 / np.sqrt(3 * k))
         radius = aim
         for _ in range(ROUNDS):

@@ -212,8 +212,16 @@ class Fibre:
         if (attrs := geometry.get("fibre")) is None:
             return None
         stages, substeps, pixels = (int(geometry[key]) for key in ("stages", "substeps", "pixels"))
-        bands = (tuple(int(first) for first in attrs["bands"][arm]) for arm in ARMS)
-        return cls(stages, substeps, int(attrs["rows"]), int(attrs["columns"]), pixels, *bands)
+        bands_a, bands_b = (tuple(int(first) for first in attrs["bands"][arm]) for arm in ARMS)
+        return cls(
+            stages=stages,
+            substeps=substeps,
+            rows=int(attrs["rows"]),
+            columns=int(attrs["columns"]),
+            sensor_pixels=pixels,
+            bands_a=bands_a,
+            bands_b=bands_b,
+        )
 
 
 def _check_sizes(stages: int, substeps: int, rows: int, columns: int) -> None:

@@ -14,7 +14,7 @@ class LineFlag(IntFlag):
     MISSING = 1
     """Never arrived; the row is filled with 0."""
     INCOMPLETE = 2
-    """The camera reported that part of the line is not valid."""
+    """Part of the line is not valid, or its number is in doubt because the camera missed triggers."""
     SATURATED = 4
     """At least one pixel is at the top of the range."""
     TIME_ESTIMATED = 8

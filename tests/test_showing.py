@@ -56,7 +56,15 @@ def test_results_show_what_can_be_trusted(recording: Recording, tmp_path: Path) 
     )
     assert "data:image/png;base64," in result._repr_html_()
     provenance = {"trusted": [trusted.start, trusted.stop]}
-    write_video(tmp_path / "v.zarr", result.video, result.time_ns, 2.0, 2e4, provenance, pixel_unit=None)
+    write_video(
+        tmp_path / "v.zarr",
+        result.video,
+        result.time_ns,
+        pixel_size=2.0,
+        frame_interval_ns=2e4,
+        provenance=provenance,
+        pixel_unit=None,
+    )
     file = open_video(tmp_path / "v.zarr")
     shape = f"frames {len(result.video)} of 8 x 8 float32, 20 us each, pixel 2 x 2 fine pixels"
     assert repr(file) == f"<VideoFile: {shape}, {words}>"

@@ -96,7 +96,7 @@ def record(clip: Path, seed: int, directory: Path) -> Case:
 
 
 def solve(case: Case, solver: str, budget_s: float) -> tuple[Reconstruction, NDArray[np.float32]]:
-    result = reconstruct(case.segment, *VOXELS, "best", budget_s, solver=solver)
+    result = reconstruct(case.segment, *VOXELS, "best", budget_s=budget_s, solver=solver)
     return result, result.video[result.trusted]
 
 

@@ -37,6 +37,7 @@ K = TOP_DN / FULL_WELL_E
 NOISE = [{"kind": "shot_noise"}, {"kind": "read_noise", "sigma_e": READ_E}]
 EFFECTS = {"effects": NOISE, "system_gain_dn_per_e": K}
 BLOCK = 16
+"""Number, or nearly so, of the sub-steps of a frame whose mean is the true frame."""
 
 
 def still_scene(home: Path, seed: int) -> dict[str, object]:

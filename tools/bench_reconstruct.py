@@ -111,7 +111,7 @@ def compare(name: str, case: Case, seed: int, solvers: list[str], run: Run) -> N
     voxels = truth(scene, case.geometry.substeps * case.first_line, case.geometry.span, *case.merges)
     for budget_s, goal in case.goals:
         for solver in solvers:
-            result = reconstruct(segment, *case.merges, "best", budget_s, solver=solver)
+            result = reconstruct(segment, *case.merges, "best", budget_s=budget_s, solver=solver)
             frames = judged(result)
             db = psnr(result.video[frames], voxels[frames])
             more = curves(case, scene, result) if isinstance(scene, LedScene) else ""
@@ -147,7 +147,9 @@ def against_twist(name: str, case: Case, seed: int, run: Run) -> None:
 
     def attempt(solver: str, iterations: int, budget_s: float | None = None) -> Trial:
         began = time.process_time()
-        result = reconstruct(segment, *case.merges, "best", budget_s, solver=solver, iterations=iterations)
+        result = reconstruct(
+            segment, *case.merges, "best", budget_s=budget_s, solver=solver, iterations=iterations
+        )
         processor_s = time.process_time() - began
         frames = judged(result)
         return Trial(psnr(result.video[frames], voxels[frames]), result.seconds, processor_s)

@@ -8,6 +8,11 @@
                              │
                              └──▶ apply: a segment's offsets, responsivities, mask, alignment, optics
 
+    steps       columns (dark, ambient, flat), linearity and curve, delay and delay_sweep,
+                target (orientation, align) with field, psf, veil; still: a target's image from one arm
+    around them checks (does the recording suit?), guide (what to put in front of the lens), words
+    afterwards  choose (which calibration), check (is it still valid?)
+
 A calibration holds measurements and nothing else, and a property that was not measured is not corrected.
 Lines on disk are never altered.
 """

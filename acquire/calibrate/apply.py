@@ -126,8 +126,21 @@ def calibrated(segment: Segment, calibration: Calibration) -> Segment:
 
 
 def aligned(segment: Segment, found: AlignmentFound | None) -> Segment:
-    """Return the segment with arm B's alignment, if there is one."""
-    return segment if found is None else _without_interpolation(replace(segment, alignment=found.alignment))
+    """Return the segment with arm B's alignment, if there is one.
+
+    Registration blurs arm B in the model, and the measured width includes that: it is subtracted here.
+    """
+    if found is None:
+        return segment
+    segment = replace(segment, alignment=found.alignment)
+    if segment.blur is None:
+        return segment
+    from acquire.forward import interpolation_variance  # compiled loops, which a capture host lacks
+
+    rows, columns = interpolation_variance(found.alignment, segment.geometry.size)
+    along, across = segment.blur.b  # of arm B's charge, which moves along the scene's columns
+    left = (max(0.0, along**2 - columns) ** 0.5, max(0.0, across**2 - rows) ** 0.5)
+    return replace(segment, blur=replace(segment.blur, b=left))
 
 
 def belongs_to_flat(calibration: Calibration) -> bool:
@@ -217,18 +230,6 @@ def veil_of(calibration: Calibration) -> tuple[float, float] | None:
     found = calibration.quantities["veil"]
     a, b = np.where(found.value > CLEAR * found.uncertainty, found.value, 0.0).tolist()
     return (a, b) if a or b else None
-
-
-def _without_interpolation(segment: Segment) -> Segment:
-    """Subtract from arm B's blur what registration adds in the model: the measured width includes both."""
-    if segment.blur is None or segment.alignment is None:
-        return segment
-    from acquire.forward import interpolation_variance  # compiled loops, which a capture host lacks
-
-    rows, columns = interpolation_variance(segment.alignment, segment.geometry.size)
-    along, across = segment.blur.b  # of arm B's charge, which moves along the scene's columns
-    left = (max(0.0, along**2 - columns) ** 0.5, max(0.0, across**2 - rows) ** 0.5)
-    return replace(segment, blur=replace(segment.blur, b=left))
 
 
 def _noise(calibration: Calibration) -> Noise | None:

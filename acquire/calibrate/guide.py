@@ -6,7 +6,7 @@ this list.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import KW_ONLY, dataclass
 from typing import Literal
 
 
@@ -24,6 +24,7 @@ class Step:
 
     name: str
     prepare: str
+    _: KW_ONLY
     lines: int | None
     code: Literal["rig", "dark", "steady"]
     finds: tuple[str, ...]
@@ -43,51 +44,57 @@ LEAST_SWEEP_LINES = 1024
 DELAY = Step(
     "delay",
     "Put a bright scene in, at rest, larger than the field, as for the flat; it need not be uniform.",
-    None,
-    "rig",
-    ("delay",),
-    LEAST_SWEEP_LINES,
+    lines=None,
+    code="rig",
+    finds=("delay",),
+    least_lines=LEAST_SWEEP_LINES,
 )
-DARK = Step("dark", "Leave everything as in use; the light stays off.", NOISE_LINES, "dark", ("dark",))
+DARK = Step(
+    "dark",
+    "Leave everything as in use; the light stays off.",
+    lines=NOISE_LINES,
+    code="dark",
+    finds=("dark",),
+)
 LINEARITY = Step(
     "linearity",
     "Put a white scene in, at rest; steady light at 80 % of white or more, if need be just saturated.",
-    RAMP_LINES,
-    "steady",
-    ("linearity", "transfer"),
+    lines=RAMP_LINES,
+    code="steady",
+    finds=("linearity", "transfer"),
     after="dark",
 )
 FLAT = Step(
     "flat",
     "Put a uniform white scene in, larger than the field; the light stays on, best at 50 to 70 % of it.",
-    NOISE_LINES,
-    "steady",
-    ("flat", "transfer"),
+    lines=NOISE_LINES,
+    code="steady",
+    finds=("flat", "transfer"),
     after="dark",
 )
 TARGET = Step(
     "target",
     "Put a target in, at rest, with sharp, irregular texture: dots or bars of 2 to 6 fine pixels.",
-    LINES,
-    "rig",
-    ("orientation", "align"),
+    lines=LINES,
+    code="rig",
+    finds=("orientation", "align"),
 )
 PSF = Step(
     "psf",
     "Put a square or a checkerboard in, at rest and in focus, turned by 3 to 20 degrees, its edges 30 fine "
     "pixels or more from one another.",
-    LINES,
-    "rig",
-    ("psf",),
+    lines=LINES,
+    code="rig",
+    finds=("psf",),
 )
 """It needs neither dark nor flat, since columns that differ by 3 % do not change the width of edges."""
 VEIL = Step(
     "veil",
     "Put a target in, at rest, a few percent of which send no light at all: holes in a white card before a "
     "dark room, or chrome on glass lit from behind. Printed black is not black enough.",
-    NOISE_LINES,
-    "rig",
-    ("veil",),
+    lines=NOISE_LINES,
+    code="rig",
+    finds=("veil",),
     after="dark",
 )
 STEPS = (DELAY, DARK, LINEARITY, FLAT, TARGET, PSF, VEIL)

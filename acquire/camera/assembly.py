@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import deque
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
@@ -134,7 +135,13 @@ class Frame:
 
 
 class Assembly:
-    """Makes blocks from the frames of one acquisition, and counts them.
+    """Makes blocks from the frames of one acquisition, counts them, and remembers whose buffers they use.
+
+    ::
+
+        take(frame) ──▶ ready ──▶ next_block() ──▶ lent ──▶ release(block)
+             │                                                    │
+             └───▶ buffers without lines: to be queued again ◀────┘
 
     A frame without a number waits until the next one with a number has come: see `acquire.camera.frames`.
     """
@@ -149,23 +156,24 @@ class Assembly:
         self._waiting: list[Frame] = []
         self._unnumbered = 0
         self._owed: tuple[CameraLoss, ...] = ()
+        self._ready: deque[tuple[CameraBlock, Any]] = deque()
+        self._lent: dict[CameraBlock, Any] = {}
         self._statistics = dict.fromkeys(STATISTICS, 0)
 
-    def take(self, frame: Frame) -> tuple[list[tuple[CameraBlock, Any]], list[Any]]:
-        """Return blocks that have their place now, in order with their buffers, and buffers that are free
-        again.
+    def take(self, frame: Frame) -> list[Any]:
+        """Take a filled frame, and return the buffers that are free again.
 
         Raises CameraError if the camera's frame IDs make no sense.
         """
         self._statistics["incomplete_frames"] += not frame.complete
         if frame.facts.frame_id is None:
-            return [], self._wait(frame)
+            return self._wait(frame)
         # False once waiting frames were given up: the rest could not fill the whole hole.
         keep = len(self._waiting) == self._unnumbered
         place = self._count.place(frame.facts, self._unnumbered, keep=keep)
         if place is None:
             self._statistics["stale_frames"] += 1
-            return [], [frame.buffer]
+            return [frame.buffer]
         # Only now: the size of a frame shows how its lines are packed, see `for_frames`.
         if self._reader is None:
             found = self._format
@@ -178,12 +186,14 @@ class Assembly:
         frames = [*waiting, frame] if place.kept else [frame]
         first = place.first_line - (len(frames) - 1) * self._format.height
         places = [replace(place, first_line=first + k * self._format.height) for k in range(len(frames))]
-        blocks = [(self._block(*pair), pair[0].buffer) for pair in zip(frames, places, strict=True)]
         free = [] if place.kept else [waited.buffer for waited in waiting]
-        return (
-            [(block, buffer) for block, buffer in blocks if block is not None],
-            free + [buffer for block, buffer in blocks if block is None],
-        )
+        for each, its_place in zip(frames, places, strict=True):
+            block = self._block(each, its_place)
+            if block is None:
+                free.append(each.buffer)
+            else:
+                self._ready.append((block, each.buffer))
+        return free
 
     def _wait(self, frame: Frame) -> list[Any]:
         """Let the frame wait for a number; return the buffers that have to be given up for that."""
@@ -220,10 +230,25 @@ class Assembly:
             frame.facts.time_ns,
         )
 
-    def count(self, block: CameraBlock) -> None:
-        """Count a block that is being delivered."""
+    def next_block(self) -> CameraBlock | None:
+        """Return the next block that has its place; its buffer is lent until `release`. None if none has."""
+        if not self._ready:
+            return None
+        block, buffer = self._ready.popleft()
+        self._lent[block] = buffer
         self._statistics["lines"] += len(block.flags)
         self._statistics["lost"] += sum(loss.count for loss in block.losses)
+        return block
+
+    def release(self, block: CameraBlock) -> Any:
+        """Return the block's buffer, which is free again; None if it is not lent."""
+        return self._lent.pop(block, None)
+
+    def forget_buffers(self) -> None:
+        """Drop all blocks at the end of the acquisition, which frees their memory."""
+        self._ready.clear()
+        self._lent.clear()
+        self._waiting.clear()
 
     def statistics(self) -> dict[str, int]:
         return dict(self._statistics)

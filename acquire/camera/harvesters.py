@@ -17,7 +17,6 @@ import signal
 import threading
 import time
 import warnings
-from collections import deque
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
@@ -100,8 +99,6 @@ class HarvestersCamera:
         self._armed = False
         self._assembly: Assembly | None = None
         self._views: dict[int, Any] = {}
-        self._held: dict[CameraBlock, Any] = {}
-        self._ready: deque[tuple[CameraBlock, Any]] = deque()
         try:
             self._found = self._library.pick(spec.serial, spec.model)
             self._acquirer = self._library.create(self._found)
@@ -159,7 +156,9 @@ class HarvestersCamera:
         """Return the next frame's lines; those of an incomplete one are flagged, absent ones are losses."""
         if not self._armed:
             raise CameraError("a block was requested of a camera that is not armed", hint="arm it")
-        if not self._ready:
+        assert self._assembly is not None
+        block = self._assembly.next_block()
+        if block is None:
             buffer = self._await_buffer(timeout_s)
             if buffer is None:
                 # Some producers do not report that their camera is gone; reading a register does.
@@ -173,12 +172,7 @@ class HarvestersCamera:
             self._heard_s = time.monotonic()
             with translated(f"camera {self._spec.serial}"):
                 self._take(buffer)
-        if not self._ready:
-            return None
-        block, buffer = self._ready.popleft()
-        self._held[block] = buffer
-        assert self._assembly is not None
-        self._assembly.count(block)
+            block = self._assembly.next_block()
         return block
 
     def _await_buffer(self, timeout_s: float) -> Any:
@@ -218,16 +212,14 @@ class HarvestersCamera:
             rows=_or_zero(lambda: buffer.delivered_image_height),
         )
         assert self._assembly is not None
-        blocks, free = self._assembly.take(frame)
-        self._ready += blocks
-        for idle in free:
+        for idle in self._assembly.take(frame):
             self._stream.module.queue_buffer(idle, False)
 
     def _read_underruns(self) -> int:
         return _or_zero(lambda: self._stream.module.num_underrun)
 
     def release(self, block: CameraBlock) -> None:
-        buffer = self._held.pop(block, None)
+        buffer = self._assembly.release(block) if self._assembly else None
         # A stopped stream has its buffers back: queueing one of them again is an error.
         if buffer is not None and self._armed:
             with translated(f"camera {self._spec.serial}"):
@@ -238,8 +230,8 @@ class HarvestersCamera:
         if not self._armed:
             return
         self._armed = False  # first: `release` must not queue a buffer of a stream that is being stopped
-        self._held.clear()
-        self._ready.clear()
+        assert self._assembly is not None
+        self._assembly.forget_buffers()
         self._views.clear()  # before their memory is freed
         with suppress(CameraError), translated("stop"):
             self._acquirer.stop()

@@ -168,6 +168,7 @@ def _measure(
     cases: list[Case],
     repeats: int,
     kinds: tuple[Voxels, ...],
+    *,
     combinations: list[tuple[str, str, str]],
     longest_s: float,
     host: HostWatch,
@@ -236,7 +237,7 @@ def _cases(
         recording.cut(first, lines, used)  # raises for missing lines, before anything is measured
         # Runs of one name are repeats: recordings that share theirs are told apart by their places.
         name = source if stems[Path(source).stem] > 1 else Path(source).stem
-        cases.append(recording_case(name, recording, first, lines, APART, used))
+        cases.append(recording_case(name, recording, first_line=first, lines=lines, apart=APART, tile=used))
     return cases, effects
 
 

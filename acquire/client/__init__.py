@@ -13,8 +13,9 @@
             print(news.time, news.text)
         segment = client.open("run.zarr").cut(first_line, lines=263)
 
-`AsyncClient` has the same methods with `await`. Both use the API that the daemon describes at /openapi.json
-and `acquire web` at /api/openapi.json.
+`Client` (`blocking`) and `AsyncClient` (`asynchronous`) have the same methods, with `await` in the latter;
+`core` is what they share, without input or output. Both use the API that the daemon describes at
+/openapi.json and `acquire web` at /api/openapi.json.
 """
 
 from __future__ import annotations

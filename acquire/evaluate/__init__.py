@@ -8,9 +8,11 @@
                                                                       +--> summary             --+
                                                                       +--> figures, animation  --+--> report
 
-    runs of every solver --> tradeoff  accuracy, time  --> tradeoff_page
+    runs of every solver --> tradeoff  accuracy, time  --> knees, tradeoff_figures --> tradeoff_page
+        on each of       cases     recordings and procedural scenes
+    a calibration        --> calibration_page
     scenes of the paper  --> paper     its figures     --> paper.page
-    videos on disk       --> rendering movies, sheets, video_page
+    videos on disk       --> rendering movies, sheets, video_page with error_map
 
     shared by the pages: page (templates), themed (drawings), player (videos), host (load of the machine)
 

@@ -32,7 +32,13 @@ class Case:
 
 
 def recording_case(
-    name: str, recording: Recording, first_line: int, lines: int, apart: int, tile: Tile | None = None
+    name: str,
+    recording: Recording,
+    *,
+    first_line: int,
+    lines: int,
+    apart: int,
+    tile: Tile | None = None,
 ) -> Case:
     """Return a case of a recording: ``lines`` lines, with repeats ``apart`` lines apart while there are any.
 

@@ -221,10 +221,10 @@ def measure(
     judge: Judge,
     solver: str,
     voxels: Voxels,
+    *,
     preset: Preset = "balanced",
     longest_s: float | None = None,
     progress: Callable[[int, int], None] | None = None,
-    *,
     dtype: Dtype = "float32",
 ) -> Run:
     """Reconstruct once and observe intermediate results, with the time so far but without that of observing.
@@ -250,8 +250,8 @@ def measure(
         voxels.spatial_merge,
         voxels.temporal_merge,
         preset,
-        longest_s,
-        None if progress is None else lambda step: progress(step.iteration, step.iterations),
+        budget_s=longest_s,
+        progress=None if progress is None else lambda step: progress(step.iteration, step.iterations),
         solver=solver,
         dtype=dtype,
         # What a solver cannot do well is a result of a trade-off, too.

@@ -51,6 +51,7 @@ def write_page(
     runs: Sequence[Run],
     truths: Truths,
     study: Study | None,
+    *,
     directory: Path,
     heading: dict[str, Any],
     when: datetime,

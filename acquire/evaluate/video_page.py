@@ -34,6 +34,7 @@ def write_page(
     panels: Sequence[Panel],
     peaks: Sequence[float],
     times: NDArray[np.int64],
+    *,
     path: Path,
     look: Look,
     progress: Callable[[int, int], object] | None = None,

@@ -37,14 +37,18 @@ if TYPE_CHECKING:
     from acquire.recon.problem import Problem
 
 COARSE_SIDE = 24
+"""Largest number of coarse voxels along a side."""
 HELD_BY = 3
 """Largest number of stages across a coarse voxel for which the floor is low enough without a search for lamps
 (M = 72) in a slow scene: there it took a bullet and a runner for lamps."""
 TENTATIVE_ITERATIONS, FEWEST_TENTATIVE = 12, 10
+"""Number of iterations in coarse voxels, and the least in a hurry."""
 PEAK = 25.0
 """Largest ratio of the floor's highest coefficient to its median: 5 to 15 for a floor, more for light."""
 MARGIN = 1.25
+"""Factor of the last coefficient above the floor: what is just below it belongs to the scene, too."""
 FEWEST_COEFFICIENTS = 32
+"""Number of cosines of the smallest band."""
 STANDS_OUT = 9.0
 """Ratio to the median of the neighbouring cosines (`WINDOW`) above which light is detected; residuals without
 light reach 5 to 8."""

@@ -30,7 +30,9 @@ largest standard error for which it is, since a scene that changes smoothly look
 FEW_ELECTRONS = 100.0
 """Smallest (mean light / noise)² of a sample, which is its number of electrons if all noise is shot noise."""
 STUCK_SHARE = 0.5
+"""Share of the lit columns that are the same in every line, above which an arm counts as stuck."""
 NOISE_STEPS = (0.1, 0.18, 0.32, 0.56, 1.0, 1.8, 3.2, 5.6, 10.0)
+"""Factors of the prior's noise that are tried: a decade either way, in quarters."""
 
 
 @dataclass(frozen=True, slots=True)

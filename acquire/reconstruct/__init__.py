@@ -6,7 +6,12 @@
     combine   VideoRequest ──▶ sub-segments ──▶ pool ──▶ stitched in order ──▶ video
     pools     where sub-segments are solved: in this process, in others, on a cluster
     work      one sub-segment: cut, solve, resample to the grid
+    sheet     its frames in the video: in a row, or behind a fibre tile by tile
     single    a reconstruction that is already in memory, made by `reconstruct` (of `acquire.recon`)
+
+    before    propose (voxels by the tempo), budget and learned (time), explain and arms (calibration),
+              diagnose and reorient (description), liveliest (the tile to try them on)
+    together  sharing: one choice of prior for all tiles or sub-segments
 
 The sub-segments in work bound the memory: the recording is read and the video written piece by piece.
 """

@@ -8,6 +8,13 @@
     light: code and drives ─────────────┘      clock: pulses on a wire ─┘
     voxels: ground truth, for comparison
 
+    scenes    leds, digits, shutters, sprites, targets (the paper's); media (files), functions, procedural;
+              drawn with shapes and kernels
+    cameras   optics ▸ lines ▸ readout, compact (both arms on one sensor), stopwatch; pattern: without a scene
+    trigger   trigger_model with trigger_registers, trigger_run, trigger_code, arming (what it refuses); or
+              rtl: the gateware, and pins: what its cameras see; twin_links: a port to either
+    a rig     drivers ▸ instrument; gentl, gige: cameras for any program
+
 From Python, without files: ``Bench(scene_config, geometry, cameras, substep_s).camera("a", code)``, or a
 `StreamingArm` on any object that satisfies `Scene`.
 

@@ -193,6 +193,7 @@ class Wire:
         line_period_ns: Fraction,
         speed: Fraction,
         code: Mapping[str, Any],
+        *,
         start_ns: int | None = None,
         budget: int | None = None,
         settled_s: Mapping[str, float] | None = None,

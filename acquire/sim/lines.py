@@ -71,8 +71,8 @@ class StreamingArm:
         stages: int,
         substeps: int,
         arm: str,
-        optics: ArmOptics | None = None,
         *,
+        optics: ArmOptics | None = None,
         fibre: Fibre | None = None,
     ) -> None:
         required = stages * substeps if fibre is None else fibre.side

@@ -135,12 +135,12 @@ def _picture(name: str) -> Picture:
 
 def _broad_finned(y: Grid, x: Grid) -> Picture:
     """A goldfish with a round body, and with tail and fins like veils."""
-    body = _inside(_ellipse(y, x, 0.0, 0.38, 0.24, 0.4))
+    body = _inside(_ellipse(y, x, turn=0.0, centre=0.38, height=0.24, width=0.4))
     tail = _inside(np.maximum(np.abs(y) - (0.12 - 0.85 * (x + 0.0)), np.maximum(x + 0.05, -x - 0.92)))
     tail = tail * _inside(np.hypot(x - 0.05, y) - 0.95) * (1 - _inside(np.abs(y) - 0.25 * (-x - 0.45)))
     veil = 0.55 + 0.25 * np.cos(26 * np.arctan2(y, 0.25 - x))
-    dorsal = _inside(_ellipse(y + 0.34, x - 0.22, 0.5, 0.0, 0.16, 0.3)) * (y < 0)
-    pectoral = _inside(_ellipse(y - 0.36, x - 0.32, -0.6, 0.0, 0.12, 0.24))
+    dorsal = _inside(_ellipse(y + 0.34, x - 0.22, turn=0.5, centre=0.0, height=0.16, width=0.3)) * (y < 0)
+    pectoral = _inside(_ellipse(y - 0.36, x - 0.32, turn=-0.6, centre=0.0, height=0.12, width=0.24))
     light = np.maximum(0.7 * np.maximum(dorsal, pectoral), veil * tail)
     light = light * (1 - body) + body * (0.95 - 0.25 * np.abs(y) / 0.24)
     return _with_eye(light, np.maximum.reduce([body, tail, dorsal, pectoral]), y, x, 0.64)
@@ -148,10 +148,10 @@ def _broad_finned(y: Grid, x: Grid) -> Picture:
 
 def _zebra(y: Grid, x: Grid) -> Picture:
     """A goldfish with a slender body, stripes across it and a forked tail."""
-    body = _inside(_ellipse(y, x, 0.0, 0.15, 0.27, 0.72))
+    body = _inside(_ellipse(y, x, turn=0.0, centre=0.15, height=0.27, width=0.72))
     tail = _inside(np.maximum(np.abs(y) - 0.75 * (-x - 0.42), np.maximum(x + 0.45, -x - 0.92)))
     tail = tail * (1 - _inside(np.abs(y) - 0.9 * (-x - 0.7)))
-    dorsal = _inside(_ellipse(y + 0.26, x - 0.1, 0.25, 0.0, 0.14, 0.34)) * (y < 0)
+    dorsal = _inside(_ellipse(y + 0.26, x - 0.1, turn=0.25, centre=0.0, height=0.14, width=0.34)) * (y < 0)
     stripes = 0.5 + 0.5 * np.tanh(5 * np.cos(2 * np.pi * x / 0.2))
     light = np.maximum(0.75 * tail, 0.6 * dorsal) * (1 - body) + body * (0.12 + 0.88 * stripes)
     return _with_eye(light, np.maximum.reduce([body, tail, dorsal]), y, x, 0.72)
@@ -162,7 +162,7 @@ def _with_eye(light: Grid, alpha: Grid, y: Grid, x: Grid, at: float) -> Picture:
     return light * (1 - eye), alpha
 
 
-def _ellipse(y: Grid, x: Grid, turn: float, centre: float, height: float, width: float) -> Grid:
+def _ellipse(y: Grid, x: Grid, *, turn: float, centre: float, height: float, width: float) -> Grid:
     """Return the approximate signed distance to an ellipse, negative inside."""
     u = np.cos(turn) * (x - centre) - np.sin(turn) * y
     v = np.sin(turn) * (x - centre) + np.cos(turn) * y

@@ -13,7 +13,7 @@ Bars are rectangles along the axes, so the covered fraction of a pixel is exact:
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import KW_ONLY, dataclass
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
@@ -60,6 +60,7 @@ class Bar:
 
     group: int
     element: int
+    _: KW_ONLY
     top: float
     left: float
     height: float
@@ -90,7 +91,7 @@ def usaf_bars(groups: tuple[int, ...]) -> list[Bar]:
             row += 7.3 * bar_width_mm(group, element)
         bars += _element(group, 1, bottom, -1.0 * unit)
         # the square of the standard's layout, which is no element
-        bars.append(Bar(group, 0, bottom, -10.5 * unit, 5 * unit, 5 * unit))
+        bars.append(Bar(group, 0, top=bottom, left=-10.5 * unit, height=5 * unit, width=5 * unit))
         row = top
         for element in range(1, 7) if group + 1 in groups else ():
             bars += _element(group + 1, element, row, right)
@@ -134,5 +135,5 @@ def _element(group: int, element: int, top: float, left: float) -> Iterator[Bar]
     """Three vertical bars, and three horizontal ones to the right of them."""
     w = bar_width_mm(group, element)
     for k in range(3):
-        yield Bar(group, element, top, left + 2 * k * w, 5 * w, w)
-        yield Bar(group, element, top + 2 * k * w, left + 7 * w, w, 5 * w)
+        yield Bar(group, element, top=top, left=left + 2 * k * w, height=5 * w, width=w)
+        yield Bar(group, element, top=top + 2 * k * w, left=left + 7 * w, height=w, width=5 * w)

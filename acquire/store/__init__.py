@@ -4,13 +4,15 @@
 
     whole recordings   writer                     reader              verification recovery mirroring  video
       with             retention room resume      outline suspect     scan         mend     place
-      kept from loss   removal, links             opening attributes               rebuild
-                                                  extent shortfall
-    one arm            arm_writer                 camera_stream  ┐
+      kept from loss   removal, links             opening attributes  compare      rebuild
+      seen at once     overview                   extent shortfall
+    videos             video_writer, mosaic_writer (tiles), video_layout (metadata)
+    one arm            arm_writer                 camera_stream, present
     one array          array_writer → shard       stretch → chunks → array_files
     tables             table                      table_reader
     what is written    terms, spec (attributes), layout and shape (metadata), codecs (bytes)
     where              files (disk), pages, host  source → disk | remote (URLs)
+      all or nothing   delivery, refusals
 
 An `Outline` is a recording without its lines: it and everything that it uses need no array library. Names are
 imported from here lazily, so that a list of recordings comes at once. No module may have the name of a

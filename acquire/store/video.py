@@ -147,10 +147,10 @@ def write_video(
     place: Path | str,
     video: NDArray[Any],
     time_ns: NDArray[np.int64],
+    *,
     pixel_size: float,
     frame_interval_ns: float,
     provenance: Mapping[str, Any],
-    *,
     pixel_unit: str | None = "micrometer",
     origin: tuple[float, float, float] = (0.0, 0.0, 0.0),
 ) -> None:

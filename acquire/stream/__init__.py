@@ -11,11 +11,12 @@
 Grabbers, recorder and watcher are processes, the supervisor is a thread; `Capture` owns them all. Rings are
 shared memory: no pixel is sent between a camera's buffer and the recorder, and no camera waits for a reader.
 
-`losses` and their causes · `ring` · `observer` of a ring · `messages` between the processes · `grabber` ·
-`tagger` · `window` of lines around an event · `session` (one recording) · `recorder` and its
-`recorder_states` · `lightcheck`, `threshold`, `watcher` · `external_counts` of trigger, cameras and watcher ·
-`ledger` of every pulse · `plan` · `succession` of killed processes · `lifecycle` of a recording ·
-`supervisor` · `capture`
+`losses` and their causes · `ring` · `observer` of a ring, `peek` from outside · `messages` between the
+processes · `grabber`, and `lineclock` after an absence · `tagger` · `window` of lines around an event, those
+`kept` already · `opening` of a recording, `session` · `recorder`, its `recorder_plan` and `recorder_states` ·
+`stalls` · `lightcheck`, `threshold`, `watcher` · `external_counts` of trigger, cameras and watcher · `ledger`
+of every pulse · `plan` · `succession` of killed processes · `lifecycle` of a recording · `supervisor` ·
+`capture`
 """
 
 from acquire.stream.capture import Capture

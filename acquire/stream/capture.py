@@ -22,7 +22,7 @@ from acquire.processes.messages import Quit, Ready
 from acquire.processes.shared import Counters
 from acquire.processes.worker import Worker
 from acquire.stream import grabber, recorder, recorder_plan, recorder_states, watcher
-from acquire.stream.external_counts import TAG_READER_COUNTERS, TRIGGER, TRIGGER_COUNTERS, WATCHER
+from acquire.stream.external_counts import RECORDER, TAG_READER_COUNTERS, TRIGGER, TRIGGER_COUNTERS, WATCHER
 from acquire.stream.kept import Kept
 from acquire.stream.ledger import Counted, account
 from acquire.stream.lifecycle import MEANINGS, Stage
@@ -31,7 +31,7 @@ from acquire.stream.messages import Note, RunStarted
 from acquire.stream.plan import END_S, CaptureStatus
 from acquire.stream.ring import Ring, RingShape
 from acquire.stream.succession import Succession
-from acquire.stream.supervisor import RECORDER, Supervisor
+from acquire.stream.supervisor import Supervisor
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -225,15 +225,7 @@ class Capture:
             disk=plan.disk,
             goes_on=plan.goes_on,
         )
-        return Worker(
-            RECORDER,
-            recorder.record,
-            what,
-            self._rings,
-            self._tags,
-            self._counters[RECORDER],
-            {name: counters for name, counters in self._counters.items() if name != RECORDER},
-        )
+        return Worker(RECORDER, recorder.record, what, self._rings, self._tags, self._counters)
 
     def _new_watcher(self) -> Worker:
         counters = self._counters[WATCHER]

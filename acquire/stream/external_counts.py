@@ -19,7 +19,8 @@ if TYPE_CHECKING:
 
     from acquire.processes.shared import Counters
 
-TRIGGER, WATCHER = "trigger", "watcher"
+RECORDER, TRIGGER, WATCHER = "recorder", "trigger", "watcher"
+"""Keys of the counters, and of the workers; the grabbers have their arms' names."""
 _LONGEST_HOLD_UP_S = 10.0
 """Time after which the thread that passes tags on counts as stuck in its trigger's driver."""
 

@@ -28,7 +28,7 @@ from acquire.processes.messages import Ready
 from acquire.processes.rank import become_important
 from acquire.processes.worker import OwnerGone
 from acquire.store import RecordingWriter, RunCondition
-from acquire.stream.external_counts import ExternalCounts
+from acquire.stream.external_counts import RECORDER, ExternalCounts
 from acquire.stream.kept import Kept
 from acquire.stream.losses import Cause
 from acquire.stream.messages import Began, Begin, Cancel, End, Extend, Interrupt, Note, Refused, RunStarted
@@ -67,18 +67,23 @@ def record(
     plan: RecorderPlan,
     rings: dict[str, Ring],
     tags: Ring,
-    counters: Counters,
-    others: dict[str, Counters],
+    counters: dict[str, Counters],
 ) -> None:
     """Main function of the recorder: empty the rings and write recordings on request, until Quit.
 
-    ``others``: counters of cameras, trigger and watcher, see `ExternalCounts`.
+    ``counters`` are its own and, see `ExternalCounts`, those of cameras, trigger and watcher.
     """
     if plan.realtime:
         become_important()  # not in real time: it computes, and must not keep the grabbers waiting
     with ThreadPoolExecutor(1, thread_name_prefix="store") as disk:
         recorder = Recorder(
-            mailbox, plan, rings, tags=tags, counters=counters, disk=disk, external=ExternalCounts(others)
+            mailbox,
+            plan,
+            rings,
+            tags=tags,
+            counters=counters[RECORDER],
+            disk=disk,
+            external=ExternalCounts(counters),
         )
         mailbox.post(Ready())
         while recorder.turn():
@@ -93,6 +98,7 @@ class Recorder:
         mailbox: Mailbox,
         plan: RecorderPlan,
         rings: dict[str, Ring],
+        *,
         tags: Ring,
         counters: Counters,
         disk: ThreadPoolExecutor,

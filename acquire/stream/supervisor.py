@@ -14,7 +14,7 @@ from acquire.clock import NS_PER_S
 from acquire.errors import AcquireError, DeviceError, TriggerError
 from acquire.lines import ARMS
 from acquire.processes.messages import Failed, Ready
-from acquire.stream.external_counts import TRIGGER, TRIGGER_COUNTERS, WATCHER
+from acquire.stream.external_counts import RECORDER, TRIGGER, TRIGGER_COUNTERS, WATCHER
 from acquire.stream.lifecycle import UNDER_WAY, Lifecycle, Stage
 from acquire.stream.losses import Cause
 from acquire.stream.messages import Began, Cancel, Checked, End, Extend, Interrupt, Note, Refused, Sealed
@@ -30,9 +30,6 @@ if TYPE_CHECKING:
     from acquire.stream.plan import CapturePlan
     from acquire.stream.ring import Ring
     from acquire.trigger.base import LineTag, Trigger
-
-RECORDER = "recorder"
-"""Key of the recorder among the workers; the grabbers have their arms' names."""
 
 # The thread waits for tags only, and checks everything else in between: a death is noticed this much later.
 _TAG_WAIT_S = 0.02
@@ -62,6 +59,7 @@ class Supervisor:
         trigger: Trigger,
         workers: dict[str, Worker],
         tags: Ring,
+        *,
         counters: dict[str, Counters],
         plan: CapturePlan,
         succession: Succession | None = None,

@@ -48,11 +48,12 @@ OBSERVER = 0
 """The watcher's place among a ring's observers."""
 
 _CHECK_EVERY_S = 0.5
-_LOOK_S = 0.02
+_POLL_S = 0.02
 _REPORT_EVERY_S = 0.1
 """Crossings that follow sooner than this on a reported one are only counted."""
 _MOST_COLUMNS = 128
 _MOST_PROFILE_LINES = 256
+"""At most so many columns of a line, and lines of a check, are averaged: see `Intake.take`."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,7 +78,7 @@ def watch(mailbox: Mailbox, plan: WatchPlan, rings: dict[str, Ring], counters: C
     while True:
         mailbox.take()
         watcher.turn(time.monotonic())
-        waiting.poll(_LOOK_S * 1000)
+        waiting.poll(_POLL_S * 1000)
 
 
 class Watcher:
@@ -112,7 +113,7 @@ class Watcher:
                 for arm in ARMS
             }
         for arm, observer in self._observers.items():
-            self._look(arm, observer)
+            self._take_blocks(arm, observer)
         if self._intakes and all(intake.full for intake in self._intakes.values()):
             self._judge(self._plan.judge)
         elif any(intake.broken for intake in self._intakes.values()):
@@ -124,7 +125,8 @@ class Watcher:
         for observer in self._observers.values():
             observer.close()
 
-    def _look(self, arm: str, observer: Observer) -> None:
+    def _take_blocks(self, arm: str, observer: Observer) -> None:
+        """Take an arm's new blocks, for the check that is under way and for the threshold."""
         intake = self._intakes.get(arm)
         threshold = self._threshold if self._threshold and self._threshold.plan.arm == arm else None
         if threshold is None and (intake is None or intake.full):
@@ -209,6 +211,7 @@ class Intake:
 
     @property
     def full(self) -> bool:
+        """Whether all lines have come, and enough of them can be used."""
         return self._count == len(self._energy) and not self.broken
 
     def take(self, block: RingBlock) -> None:

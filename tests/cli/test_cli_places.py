@@ -124,7 +124,14 @@ def test_unreadable_files_are_reported_as_such(
 
 def test_a_video_is_distinguished_from_a_recording(cli: Cli, tmp_path: Path) -> None:
     times = np.arange(2, dtype=np.int64)
-    write_video(tmp_path / "v.zarr", np.zeros((2, 4, 4), np.float32), times, 1.0, 1e4, {})
+    write_video(
+        tmp_path / "v.zarr",
+        np.zeros((2, 4, 4), np.float32),
+        times,
+        pixel_size=1.0,
+        frame_interval_ns=1e4,
+        provenance={},
+    )
     answer = cli("info", tmp_path / "v.zarr")
     assert (answer.code, "is a video, but not a recording" in answer.err) == (2, True)
     assert "try: acquire render" in answer.err

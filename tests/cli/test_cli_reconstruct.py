@@ -405,7 +405,14 @@ def test_a_cluster_gives_the_same_result_as_this_machine(
 @pytest.mark.parametrize("suffix", [".png", ".gif", ".webp", ".mp4", ".html"])
 def test_a_disk_that_takes_no_more_ends_a_rendering_in_words(tmp_path: Path, suffix: str) -> None:
     frames = np.random.default_rng(8).random((8, 64, 64)).astype(np.float32)
-    write_video(tmp_path / "v.zarr", frames, np.arange(8, dtype=np.int64), 2.5, 1, {})
+    write_video(
+        tmp_path / "v.zarr",
+        frames,
+        np.arange(8, dtype=np.int64),
+        pixel_size=2.5,
+        frame_interval_ns=1,
+        provenance={},
+    )
     limited = "import resource; resource.setrlimit(resource.RLIMIT_FSIZE, (3000, -1));"
     program = [sys.executable, "-c", f"{limited} from acquire.cli import main; raise SystemExit(main())"]
     out = tmp_path / f"v{suffix}"

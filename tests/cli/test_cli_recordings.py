@@ -137,7 +137,9 @@ def test_ls_survives_recordings_that_cannot_be_described(cli: Cli, recording: Pa
 
 def test_ls_leaves_videos_out(cli: Cli, recording: Path) -> None:
     video, times = np.zeros((2, 4, 4), np.float32), np.arange(2, dtype=np.int64)
-    write_video(recording.parent / "a-video.zarr", video, times, 1.0, 1e4, {})
+    write_video(
+        recording.parent / "a-video.zarr", video, times, pixel_size=1.0, frame_interval_ns=1e4, provenance={}
+    )
     assert [Path(item["path"]).name for item in cli("ls", recording.parent, "--json").json] == ["one.zarr"]
 
 
@@ -145,7 +147,7 @@ def test_ls_says_what_else_there_is_and_what_shows_it(cli: Cli, tmp_path: Path) 
     """It said that there were no recordings "in" a video, and listed a calibration as a damaged recording."""
     video, times = np.zeros((2, 4, 4), np.float32), np.arange(2, dtype=np.int64)
     for name in ("one.zarr", "two.zarr"):
-        write_video(tmp_path / name, video, times, 1.0, 1e4, {})
+        write_video(tmp_path / name, video, times, pixel_size=1.0, frame_interval_ns=1e4, provenance={})
     zarr.create_group(tmp_path / "c.zarr", zarr_format=3, attributes={"format": "acquire-calibration/1"})
     listed = cli("ls", tmp_path)
     assert (listed.code, listed.out) == (

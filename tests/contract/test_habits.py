@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import re
 import subprocess
 import sys
@@ -42,6 +43,26 @@ def test_the_drawing_of_the_layers_is_the_contract() -> None:
         drawn += row.strip()[:33].split()
     assert sorted(drawn) == sorted(floor)
     assert [floor[name] for name in drawn] == sorted(floor.values())
+
+
+DRAW_SOMETHING_ELSE = {"daemon", "web", "evaluate/paper", "sim/effects"}
+"""Rooms whose drawing is of threads and requests, of figures, or of kinds, instead of modules."""
+
+
+def test_the_drawing_of_a_room_names_its_modules() -> None:
+    """A newcomer looks there for what a module does; `reconstruct` named six of its sixteen."""
+    unnamed = {}
+    for init in sorted((ROOT / "acquire").rglob("__init__.py")):
+        room, text = init.parent, ast.get_docstring(ast.parse(init.read_text(encoding="utf-8"))) or ""
+        name = str(room.relative_to(ROOT / "acquire"))
+        if "::" not in text or name in {*DRAW_SOMETHING_ELSE, "."}:
+            continue
+        modules = {path.stem for path in room.glob("[a-z]*.py")} | {
+            path.parent.name for path in room.glob("*/__init__.py")
+        }
+        if missing := modules - set(re.findall(r"\w+", text)):
+            unnamed[name] = sorted(missing)
+    assert unnamed == {}
 
 
 def test_modules_of_tests_have_names_of_their_own() -> None:

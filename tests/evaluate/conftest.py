@@ -1,3 +1,5 @@
+"""The result that the tests of figures, summaries and pages share."""
+
 from __future__ import annotations
 
 import pytest

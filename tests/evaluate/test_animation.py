@@ -1,3 +1,5 @@
+"""The animation of a result: which frames it shows, how large it is, and what its pixels are."""
+
 from __future__ import annotations
 
 from dataclasses import replace

@@ -1,3 +1,5 @@
+"""Sinusoids in a region of a video: mean, fit and comparison, against curves whose parameters are known."""
+
 from __future__ import annotations
 
 import numpy as np

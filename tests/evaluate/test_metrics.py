@@ -1,3 +1,5 @@
+"""PSNR and SSIM against closed forms and scikit-image."""
+
 from __future__ import annotations
 
 import math

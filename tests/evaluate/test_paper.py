@@ -66,8 +66,10 @@ def test_claims_in_words_hold_or_not_and_are_never_better(r: float, expected: bo
 
 
 def test_times_and_frequencies_say_by_how_much() -> None:
-    assert faster("time", "", "", 60.0, 600.0, "elsewhere").by == "× 10 faster, elsewhere"
-    assert faster("time", "", "", 900.0, 600.0, "elsewhere").verdict == "worse"
+    assert (
+        faster("time", "", "", seconds=60.0, paper_s=600.0, where="elsewhere").by == "× 10 faster, elsewhere"
+    )
+    assert faster("time", "", "", seconds=900.0, paper_s=600.0, where="elsewhere").verdict == "worse"
     assert frequency("x", "", "", 4999.5, 5000.0).by == "error 0.5 Hz, 0.01%"
     assert frequency("x", "", "", 4900.0, 5000.0).verdict == "does not hold"
     assert same("video", "", "", equal=False).verdict == "worse"

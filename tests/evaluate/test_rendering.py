@@ -21,7 +21,14 @@ def panel(tmp_path, name, frames, interval_ns, side=12, begin=0):
     video[np.arange(frames), 0, np.arange(frames) % side] = 1
     video[:, side // 2 :, :] = 0.5
     path = tmp_path / f"{name}.zarr"
-    write_video(path, video, START + begin + np.arange(frames) * interval_ns, 1.0, interval_ns, {})
+    write_video(
+        path,
+        video,
+        START + begin + np.arange(frames) * interval_ns,
+        pixel_size=1.0,
+        frame_interval_ns=interval_ns,
+        provenance={},
+    )
     return Panel(name, open_video(path))
 
 
@@ -62,7 +69,14 @@ def test_tiles_that_were_not_reached_are_black_and_the_others_as_usual(tmp_path,
     video = np.full((6, 12, 24), 0.5, np.float32)
     video[:, 0, 0] = 1
     video[:, :, 12:] = np.nan
-    write_video(tmp_path / "v.zarr", video, START + np.arange(6) * 1000, 1.0, 1000, {"trusted": [0, 0]})
+    write_video(
+        tmp_path / "v.zarr",
+        video,
+        START + np.arange(6) * 1000,
+        pixel_size=1.0,
+        frame_interval_ns=1000,
+        provenance={"trusted": [0, 0]},
+    )
     assert render([Panel("v", open_video(tmp_path / "v.zarr"))], tmp_path / f"r{suffix}", Look(48), 6) > 0
     if suffix == ".png":
         with Image.open(tmp_path / "r.png") as sheet:
@@ -73,7 +87,14 @@ def test_tiles_that_were_not_reached_are_black_and_the_others_as_usual(tmp_path,
 
 def test_a_video_of_which_nothing_was_reached_is_black(tmp_path):
     video = np.full((3, 12, 12), np.nan, np.float32)
-    write_video(tmp_path / "v.zarr", video, START + np.arange(3) * 1000, 1.0, 1000, {"trusted": [0, 0]})
+    write_video(
+        tmp_path / "v.zarr",
+        video,
+        START + np.arange(3) * 1000,
+        pixel_size=1.0,
+        frame_interval_ns=1000,
+        provenance={"trusted": [0, 0]},
+    )
     assert render([Panel("v", open_video(tmp_path / "v.zarr"))], tmp_path / "r.png", Look(48), 3) == 3
 
 

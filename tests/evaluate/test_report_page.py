@@ -1,3 +1,5 @@
+"""The demo's page holds every number and text of its summary, and refers to nothing outside itself."""
+
 from __future__ import annotations
 
 import json

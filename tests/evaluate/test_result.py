@@ -1,3 +1,5 @@
+"""A result is consistent, and its summary survives JSON."""
+
 from __future__ import annotations
 
 import json

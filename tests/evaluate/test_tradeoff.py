@@ -63,7 +63,7 @@ def test_intermediate_results_of_one_run_are_evaluated(judge, run):
 
 
 def test_a_run_that_exceeds_its_budget_is_marked_as_cut(judge):
-    short = measure(judge, "twist", VOXELS, "best", 0.2)
+    short = measure(judge, "twist", VOXELS, preset="best", longest_s=0.2)
     assert short.cut
     assert not replace(short, ended="converged").cut
 
@@ -75,11 +75,11 @@ def test_the_end_of_a_run_has_the_time_of_its_solver_alone(judge, monkeypatch):
         raise AssertionError("the error was estimated")
 
     monkeypatch.setattr("acquire.recon.api.estimate_error", estimate)
-    assert measure(judge, "admm", VOXELS, "fast").end.psnr_db is not None
+    assert measure(judge, "admm", VOXELS, preset="fast").end.psnr_db is not None
 
 
 def test_a_real_recording_has_no_truth(judge):
-    blind = measure(Judge(judge.segment, None), "admm", VOXELS, "fast")
+    blind = measure(Judge(judge.segment, None), "admm", VOXELS, preset="fast")
     assert blind.end.psnr_db is None
     assert 0 < blind.end.prediction < 1
     assert blind.end.frame is not None
@@ -100,7 +100,7 @@ def test_the_truth_of_the_baseline_is_in_its_own_pixels_and_sub_steps(tmp_path):
     geometry = judge.segment.geometry
     true = judge.truth(Voxels(1, 1))
     assert true.shape == (len(range(geometry.span)[geometry.trusted]), 12, 12)
-    found = measure(judge, "admm", Voxels(1, geometry.span), "fast").end
+    found = measure(judge, "admm", Voxels(1, geometry.span), preset="fast").end
     assert found.psnr_db > 25
 
 
@@ -145,7 +145,7 @@ def test_the_front_holds_results_that_nothing_reaches_sooner():
 def test_a_study_of_lost_lines_alone_has_no_plot(run, tmp_path):
     """They are not compared with the noise, and the plot had no point to scale its axes by."""
     study = Study(1.0, 100.0, 2.0, 2.5, (Worth("dropped_lines", "stream", 0.0, None, 0.5),))
-    write_page([run], {}, study, tmp_path, HEADING, datetime.now(UTC))
+    write_page([run], {}, study, directory=tmp_path, heading=HEADING, when=datetime.now(UTC))
     document = json.loads((tmp_path / "tradeoff.json").read_text())
     assert [each["effect"] for each in document["study"]["effects"]] == ["dropped_lines"]
     assert not list(tmp_path.glob("effects*"))
@@ -156,7 +156,14 @@ def test_page_and_table_agree(judge, run, tmp_path):
     cut = replace(run, repeat=1, ended="budget")
     exact = replace(run, dtype="float64", case="another")
     true = judge.truth(VOXELS)[judge.picked(VOXELS)]
-    page = write_page([run, cut, exact], {("", VOXELS): true}, None, tmp_path, HEADING, datetime.now(UTC))
+    page = write_page(
+        [run, cut, exact],
+        {("", VOXELS): true},
+        None,
+        directory=tmp_path,
+        heading=HEADING,
+        when=datetime.now(UTC),
+    )
     text = page.read_text()
     assert text.count("<picture>") == 2 * 6  # PSNR by two clocks, frames, SSIM, amplitude, frequency
     assert text.count('<figure class="player') == 2

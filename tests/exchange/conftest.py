@@ -61,7 +61,7 @@ def video(tmp_path_factory: pytest.TempPathFactory) -> Path:
     frames = np.random.default_rng(6).random((20, 7, 5)).astype(np.float32)
     time_ns = TIME + INTERVAL_NS * np.arange(20, dtype=np.int64)
     provenance = {"recording": "run.zarr", "trusted": [TRUSTED.start, TRUSTED.stop]}
-    write_video(path, frames, time_ns, 2.5, INTERVAL_NS, provenance)
+    write_video(path, frames, time_ns, pixel_size=2.5, frame_interval_ns=INTERVAL_NS, provenance=provenance)
     return path
 
 

@@ -151,7 +151,14 @@ SUFFIXES = (".tif", ".ome.tif", ".h5", ".npz", ".mp4")
 def test_a_movie_is_black_where_no_tile_was_reached(tmp_path: Path, reached: int) -> None:
     frames, time_ns = np.full((4, 8, 6), 2.0, np.float32), np.arange(4, dtype=np.int64)
     frames[:, :, reached:] = np.nan
-    write_video(tmp_path / "v.zarr", frames, time_ns, 1.0, 1, {"trusted": [0, 0]})
+    write_video(
+        tmp_path / "v.zarr",
+        frames,
+        time_ns,
+        pixel_size=1.0,
+        frame_interval_ns=1,
+        provenance={"trusted": [0, 0]},
+    )
     export(video_content(open_video(tmp_path / "v.zarr"), "v", whole=True), tmp_path / "v.mp4")
     with av.open(str(tmp_path / "v.mp4")) as file:
         shown = next(file.decode(video=0)).to_ndarray(format="gray")
@@ -173,7 +180,15 @@ def test_frames_of_which_none_is_trusted_are_written(
 @pytest.mark.parametrize("suffix", SUFFIXES)
 def test_odd_names_and_units_are_escaped_where_a_format_cannot_hold_them(tmp_path: Path, suffix: str) -> None:
     frames, time_ns = np.ones((3, 7, 5), np.float32), np.arange(3, dtype=np.int64)
-    write_video(tmp_path / "video.zarr", frames, time_ns, 2.5, 1, {}, pixel_unit="µm")
+    write_video(
+        tmp_path / "video.zarr",
+        frames,
+        time_ns,
+        pixel_size=2.5,
+        frame_interval_ns=1,
+        provenance={},
+        pixel_unit="µm",
+    )
     out = tmp_path / f"Gerät 1{suffix}"
     assert export(video_content(open_video(tmp_path / "video.zarr"), "caf\udce9 \x01é"), out) > 0
     if suffix == ".tif":
@@ -214,7 +229,7 @@ def test_a_movie_shows_what_the_video_holds(
 def test_white_is_found_wherever_it_is(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, column: int) -> None:
     frames, time_ns = np.full((2, 64, 32), 0.01, np.float32), np.arange(2, dtype=np.int64)
     frames[:, :, column] = 1
-    write_video(tmp_path / "video.zarr", frames, time_ns, 2.5, 1, {})
+    write_video(tmp_path / "video.zarr", frames, time_ns, pixel_size=2.5, frame_interval_ns=1, provenance={})
     monkeypatch.setattr(movie, "SAMPLED", 2 * 64 * 2)  # every 16th voxel: of two columns of 32
     export(video_content(open_video(tmp_path / "video.zarr"), "v"), tmp_path / "v.mp4")
     with av.open(str(tmp_path / "v.mp4")) as file:
@@ -407,7 +422,14 @@ def test_a_disk_that_takes_no_more_is_an_error_and_not_the_end_of_the_process(
 ) -> None:
     """HDF5 itself crashes when it closes a file that it cannot write."""
     frames = np.random.default_rng(8).random((8, 64, 64)).astype(np.float32)
-    write_video(tmp_path / "v.zarr", frames, np.arange(8, dtype=np.int64), 2.5, 1, {})
+    write_video(
+        tmp_path / "v.zarr",
+        frames,
+        np.arange(8, dtype=np.int64),
+        pixel_size=2.5,
+        frame_interval_ns=1,
+        provenance={},
+    )
     limited = f"import resource; resource.setrlimit(resource.RLIMIT_FSIZE, ({most_bytes}, -1));"
     program = [sys.executable, "-c", f"{limited} from acquire.cli import main; raise SystemExit(main())"]
     words = ["export", str(tmp_path / "v.zarr"), str(tmp_path / f"v{suffix}")]

@@ -59,7 +59,9 @@ def test_a_video_is_its_trusted_frames_at_their_place(video: Path) -> None:
 )
 def test_a_video_without_trusted_frames_is_reported(tmp_path: Path, provenance: object, words: str) -> None:
     frames, times = np.zeros((4, 3, 3), np.float32), np.arange(4, dtype=np.int64)
-    write_video(tmp_path / "v.zarr", frames, times, 1.0, 1.0, provenance)  # type: ignore[arg-type]
+    write_video(
+        tmp_path / "v.zarr", frames, times, pixel_size=1.0, frame_interval_ns=1.0, provenance=provenance
+    )  # type: ignore[arg-type]
     read = reader_for(str(tmp_path / "v.zarr"))
     assert read is not None
     ((data, options, _),) = read(str(tmp_path / "v.zarr"))

@@ -23,7 +23,12 @@ def demo(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, Any]
     out = tmp_path_factory.mktemp("demo") / "run"
     command = ["demo", f"--out={out}", f"--seed={SEED}", f"--lines={LINES}", "--twist-budget=2", "--json"]
     done = subprocess.run(
-        [sys.executable, "-m", "acquire", *command], capture_output=True, text=True, timeout=600, check=False
+        [sys.executable, "-m", "acquire", *command],
+        cwd=out.parent,
+        capture_output=True,
+        text=True,
+        timeout=600,
+        check=False,
     )
     assert done.returncode == 0, done.stderr
     return out, json.loads(done.stdout)
@@ -110,6 +115,7 @@ def test_all_files_are_in_the_requested_directory(demo: tuple[Path, dict[str, An
     names = {path.name for path in out.iterdir()}
     assert {"index.html", "summary.json", "lines.png", "frames.png", "curves.png", "animation.webp"} <= names
     assert {"recording.zarr", "truth.zarr", "video.zarr", "video-twist.zarr"} <= names
+    assert [path.name for path in out.parent.iterdir()] == ["run"]
     assert "<html" in Path(summary["report"]).read_text(encoding="utf-8")
     running = [p for p in psutil.process_iter(["cmdline"]) if str(out) in " ".join(p.info["cmdline"] or [])]
     assert not running

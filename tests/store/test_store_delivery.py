@@ -27,7 +27,9 @@ def place(request, bucket, tmp_path):
 
 
 def write(place):
-    write_video(place, VIDEO, TIME_NS, 3.0, 1000.0, {"solver": "admm"})
+    write_video(
+        place, VIDEO, TIME_NS, pixel_size=3.0, frame_interval_ns=1000.0, provenance={"solver": "admm"}
+    )
 
 
 def test_a_video_is_the_same_far_away(place):

@@ -123,8 +123,6 @@ def test_without_direct_writes_it_goes_through_the_cache(path, monkeypatch):
 
 
 def test_an_unaligned_short_direct_write_goes_on_through_the_cache(path):
-    path.touch()
-    path.unlink()
     file = ShardFile(path, direct=True)
     memory = aligned_bytes(2 * PAGE)
     memory[:] = 7

@@ -313,7 +313,7 @@ def test_what_is_not_a_recording_says_so(path, tmp_path):
         (lambda d: d["consolidated_metadata"]["metadata"]["a/lines"].update(data_type="?"), "damaged"),
     ],
 )
-def test_damaged_metadata_is_told(path, change, message):
+def test_damaged_metadata_is_reported(path, change, message):
     with RecordingWriter.create(path, make_spec()) as writer:
         seal(writer)
     damage_root(path, change)
@@ -321,7 +321,7 @@ def test_damaged_metadata_is_told(path, change, message):
         open_recording(path)
 
 
-def test_a_newer_format_is_told(path):
+def test_a_newer_format_is_reported(path):
     with RecordingWriter.create(path, make_spec()) as writer:
         seal(writer)
     damage_root(path, lambda d: d["attributes"].update(format="acquire-recording/3"))
@@ -337,7 +337,7 @@ def test_a_recording_that_lost_its_root_metadata_is_damaged_and_no_wrong_path(pa
         open_recording(path)
 
 
-def test_truncated_metadata_is_told(path):
+def test_truncated_metadata_is_reported(path):
     RecordingWriter.create(path, make_spec()).close()
     data = (path / "zarr.json").read_bytes()
     (path / "zarr.json").write_bytes(data[: len(data) // 2])

@@ -33,7 +33,14 @@ def make(frames=5, side=6, dtype="float32"):
 def test_video_reads_back(tmp_path_factory, frames, side, dtype):
     path = tmp_path_factory.mktemp("v") / "v.zarr"
     video, time_ns = make(frames, side, dtype)
-    write_video(path, video, time_ns, 5.0, 30_000.0, {"recording": "r.zarr", "preset": "fast"})
+    write_video(
+        path,
+        video,
+        time_ns,
+        pixel_size=5.0,
+        frame_interval_ns=30_000.0,
+        provenance={"recording": "r.zarr", "preset": "fast"},
+    )
     file = open_video(path)
     np.testing.assert_array_equal(file.video[:], video)
     assert file.video.dtype == video.dtype
@@ -44,7 +51,7 @@ def test_video_reads_back(tmp_path_factory, frames, side, dtype):
 
 def test_metadata_is_ome_zarr_0_5(tmp_path):
     path = tmp_path / "v.zarr"
-    write_video(path, *make(), 5.0, 30_000.0, {})
+    write_video(path, *make(), pixel_size=5.0, frame_interval_ns=30_000.0, provenance={})
     ome = json.loads((path / "zarr.json").read_bytes())["attributes"]["ome"]
     assert ome["version"] == "0.5"
     (image,) = ome["multiscales"]
@@ -63,7 +70,14 @@ def test_metadata_is_ome_zarr_0_5(tmp_path):
 
 
 def test_without_a_known_pixel_size_space_has_no_unit(tmp_path):
-    write_video(tmp_path / "v.zarr", *make(), 1.0, 30_000.0, {}, pixel_unit=None)
+    write_video(
+        tmp_path / "v.zarr",
+        *make(),
+        pixel_size=1.0,
+        frame_interval_ns=30_000.0,
+        provenance={},
+        pixel_unit=None,
+    )
     axes = open_video(tmp_path / "v.zarr").attrs["ome"]["multiscales"][0]["axes"]
     assert [axis.get("unit") for axis in axes] == ["second", None, None]
 
@@ -72,7 +86,15 @@ def test_xarray_has_times_and_places_as_coordinates(tmp_path):
     video, time_ns = make()
     origin = (0.5, 2.0, 2.0)
     provenance = {"trusted": [1, 4]}
-    write_video(tmp_path / "v.zarr", video, time_ns, 5.0, 30_000.0, provenance, origin=origin)
+    write_video(
+        tmp_path / "v.zarr",
+        video,
+        time_ns,
+        pixel_size=5.0,
+        frame_interval_ns=30_000.0,
+        provenance=provenance,
+        origin=origin,
+    )
     with xarray.open_zarr(tmp_path / "v.zarr", chunks=None, consolidated=False) as dataset:
         image = dataset["0"]
         assert image.dims == ("t", "y", "x")
@@ -89,13 +111,26 @@ def test_xarray_has_times_and_places_as_coordinates(tmp_path):
 
 def test_viewers_that_take_all_arrays_of_a_group_find_the_image_alone(tmp_path):
     """As napari's own reader does: the groups of a group, or else all of its arrays, are levels."""
-    write_video(tmp_path / "v.zarr", *make(), 5.0, 30_000.0, {"trusted": [0, 5]})
+    write_video(
+        tmp_path / "v.zarr",
+        *make(),
+        pixel_size=5.0,
+        frame_interval_ns=30_000.0,
+        provenance={"trusted": [0, 5]},
+    )
     group = zarr.open(tmp_path / "v.zarr", mode="r")
     assert (list(group.group_keys()), sorted(group.array_keys())) == ([], ["0"])
 
 
 def test_the_validator_of_ome_zarr_is_content(tmp_path):
-    write_video(tmp_path / "v.zarr", *make(), 5.0, 30_000.0, {"trusted": [2, 4]}, origin=(0.1, 2.0, 2.0))
+    write_video(
+        tmp_path / "v.zarr",
+        *make(),
+        pixel_size=5.0,
+        frame_interval_ns=30_000.0,
+        provenance={"trusted": [2, 4]},
+        origin=(0.1, 2.0, 2.0),
+    )
     group = zarr.open_group(tmp_path / "v.zarr", mode="r")
     image = ome_zarr_models.v05.Image.from_zarr(group)
     assert [axis.name for axis in image.attributes.ome.multiscales[0].axes] == ["t", "y", "x"]
@@ -109,7 +144,9 @@ def test_the_validator_of_ome_zarr_is_content(tmp_path):
 def test_a_large_video_has_smaller_copies(tmp_path, monkeypatch):
     monkeypatch.setattr(video_layout, "LARGE", 8)
     video, time_ns = make(5, 21, "uint8")
-    write_video(tmp_path / "v.zarr", video, time_ns, 5.0, 30_000.0, {})
+    write_video(
+        tmp_path / "v.zarr", video, time_ns, pixel_size=5.0, frame_interval_ns=30_000.0, provenance={}
+    )
     group = zarr.open_group(tmp_path / "v.zarr", mode="r")
     assert [group[name].shape[1:] for name in sorted(group.array_keys())] == [(21, 21), (11, 11), (6, 6)]
     even = video[:, :20, :20].reshape(5, 10, 2, 10, 2).mean(axis=(2, 4))
@@ -135,7 +172,9 @@ def test_a_video_of_an_older_version_opens(tmp_path):
     """All its arrays were listed, and nothing beyond time and quality lay beside the image."""
     video, time_ns = make()
     path = tmp_path / "v.zarr"
-    write_video(path, video, time_ns, 5.0, 30_000.0, {"trusted": [1, 4]})
+    write_video(
+        path, video, time_ns, pixel_size=5.0, frame_interval_ns=30_000.0, provenance={"trusted": [1, 4]}
+    )
     for name in ("t", "y", "x", "trusted"):
         shutil.rmtree(path / name)
     root = json.loads((path / "zarr.json").read_bytes())
@@ -153,7 +192,7 @@ def test_an_existing_path_is_refused(tmp_path):
     path = tmp_path / "v.zarr"
     path.mkdir()
     with pytest.raises(UsageError, match="exists already"):
-        write_video(path, *make(), 5.0, 30_000.0, {})
+        write_video(path, *make(), pixel_size=5.0, frame_interval_ns=30_000.0, provenance={})
     assert not list(path.iterdir())
 
 
@@ -191,7 +230,7 @@ def test_a_disk_that_refuses_the_first_files_is_left_as_it_was(tmp_path, monkeyp
 
     monkeypatch.setattr(video_writer, step, refuse)
     with pytest.raises(StoreError, match="No space left"):
-        write_video(tmp_path / "v.zarr", *make(), 5.0, 30_000.0, {})
+        write_video(tmp_path / "v.zarr", *make(), pixel_size=5.0, frame_interval_ns=30_000.0, provenance={})
     assert not list(tmp_path.iterdir())
 
 
@@ -209,7 +248,7 @@ def test_the_remains_of_a_killed_run_with_the_same_process_number_hinder_nobody(
     """In a container, each run may have the same number."""
     left = tmp_path / f".v.zarr.{os.getpid()}.partial"
     zarr.create_group(left)
-    write_video(tmp_path / "v.zarr", *make(), 5.0, 30_000.0, {})
+    write_video(tmp_path / "v.zarr", *make(), pixel_size=5.0, frame_interval_ns=30_000.0, provenance={})
     assert {path.name for path in tmp_path.iterdir()} == {"v.zarr", left.name}
 
 
@@ -254,7 +293,13 @@ def scaled(*scale):
     ids=str,
 )
 def test_impossible_attributes_of_a_video_are_damage(tmp_path, key, value):
-    write_video(tmp_path / "v.zarr", *make(), 5.0, 30_000.0, {"trusted": [1, 4]})
+    write_video(
+        tmp_path / "v.zarr",
+        *make(),
+        pixel_size=5.0,
+        frame_interval_ns=30_000.0,
+        provenance={"trusted": [1, 4]},
+    )
     root = json.loads((tmp_path / "v.zarr" / "zarr.json").read_text())
     root["attributes"][key] = value
     (tmp_path / "v.zarr" / "zarr.json").write_text(json.dumps(root))
@@ -263,7 +308,7 @@ def test_impossible_attributes_of_a_video_are_damage(tmp_path, key, value):
 
 
 def test_times_that_are_not_those_of_the_frames_are_damage(tmp_path):
-    write_video(tmp_path / "v.zarr", *make(), 5.0, 30_000.0, {})
+    write_video(tmp_path / "v.zarr", *make(), pixel_size=5.0, frame_interval_ns=30_000.0, provenance={})
     zarr.open_array(tmp_path / "v.zarr" / "time").resize((3,))
     with pytest.raises(DataError, match="3 times"):
         open_video(tmp_path / "v.zarr")

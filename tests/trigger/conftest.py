@@ -1,3 +1,5 @@
+"""Locks of ports in a directory of the tests, and the bench of a device."""
+
 from __future__ import annotations
 
 import contextlib

@@ -10,6 +10,7 @@ import time
 from collections.abc import Iterator
 from contextlib import closing
 from functools import partial
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -99,7 +100,7 @@ def test_a_run_is_monitored_to_its_end() -> None:
     ]
 
 
-def test_a_code_is_loaded_from_text_or_array_and_used(port: str, tmp_path) -> None:
+def test_a_code_is_loaded_from_text_or_array_and_used(port: str, tmp_path: Path) -> None:
     bits = prbs(15, 3, 0, 1000)
     (tmp_path / "code.txt").write_text("\n".join("".join(map(str, row)) for row in bits.reshape(10, 100)))
     np.save(tmp_path / "code.npy", bits)

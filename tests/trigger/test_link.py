@@ -1,3 +1,5 @@
+"""Requests and answers over a link that damages, delays and loses them, or dies."""
+
 from __future__ import annotations
 
 import threading

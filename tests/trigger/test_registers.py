@@ -1,3 +1,5 @@
+"""The definition of the registers: no overlap, and the documents that are made from it."""
+
 from __future__ import annotations
 
 from pathlib import Path

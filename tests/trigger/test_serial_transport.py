@@ -1,3 +1,5 @@
+"""Serial ports: real pseudo-terminals, their locks, and ports that vanish or stall."""
+
 from __future__ import annotations
 
 import errno

@@ -1,3 +1,5 @@
+"""The driver's runs on the model of the device: what it survives, reports and refuses."""
+
 from __future__ import annotations
 
 import threading

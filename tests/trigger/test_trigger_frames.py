@@ -1,3 +1,5 @@
+"""Frames and payloads: whatever damages the bytes, no wrong frame comes out."""
+
 from __future__ import annotations
 
 import struct

@@ -1,3 +1,5 @@
+"""The USB transport over a stand-in for libusb: missing devices, and permissions that are missing."""
+
 from __future__ import annotations
 
 import errno

@@ -5,7 +5,6 @@ from __future__ import annotations
 import ctypes
 import math
 import time
-from collections import deque
 from ctypes import byref, c_size_t, c_uint64
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
@@ -38,7 +37,9 @@ if TYPE_CHECKING:
 FAKE = "Fake"
 """Interface of Aravis' own camera, for tests; off unless the spec's ``cti`` asks for it."""
 _ALIVE_S = 0.5
+"""How often a silent camera is checked."""
 _SUCCESS, _ABORTED = 0, 7
+"""Of ArvBufferStatus."""
 _NO_ID = 2**64 - 1
 """Set in a buffer before it is filled. Only the first packet of a frame carries its number: without this, a
 buffer whose frame lost that packet would still have the number of the previous frame."""
@@ -69,8 +70,7 @@ class AravisCamera:
         self._armed = False
         self._assembly: Assembly | None = None
         self._taken: set[int] = set()
-        self._held: dict[CameraBlock, int] = {}
-        self._ready: deque[tuple[CameraBlock, int]] = deque()
+        """Buffers that Aravis does not own: taken from its stream, and not yet queued again."""
         self._payload = 0
         self._camera: int | None = None
         device_id = spec.cti.encode() if spec.cti not in ("", FAKE) else _find(library, spec)
@@ -166,14 +166,11 @@ class AravisCamera:
         """Return the next frame's lines; those of an incomplete frame are flagged."""
         if not self._armed:
             raise CameraError("a block was requested of a camera that is not armed", hint="arm it")
-        if not self._ready:
-            self._fetch(timeout_s)
-        if not self._ready:
-            return None
-        block, buffer = self._ready.popleft()
-        self._held[block] = buffer
         assert self._assembly is not None
-        self._assembly.count(block)
+        block = self._assembly.next_block()
+        if block is None:
+            self._fetch(timeout_s)
+            block = self._assembly.next_block()
         return block
 
     def _fetch(self, timeout_s: float) -> None:
@@ -207,9 +204,7 @@ class AravisCamera:
                 self._taken.remove(buffer)
                 self._give(self._stream, buffer)
                 continue
-            blocks, free = self._assembly.take(self._frame(buffer, underruns, missed))
-            self._ready += blocks
-            for idle in free:
+            for idle in self._assembly.take(self._frame(buffer, underruns, missed)):
                 self._taken.remove(idle)
                 self._give(self._stream, idle)
 
@@ -249,7 +244,8 @@ class AravisCamera:
             raise CameraLostError(f"camera {self._spec.serial} is gone: it has restarted")
 
     def release(self, block: CameraBlock) -> None:
-        buffer = self._held.pop(block, None)  # none of a block from before `disarm`, which has freed it
+        # None of a block from before `disarm`, which has freed it.
+        buffer = self._assembly.release(block) if self._assembly else None
         if buffer is not None and self._stream is not None:
             self._taken.remove(buffer)
             self._give(self._stream, buffer)
@@ -258,8 +254,8 @@ class AravisCamera:
         if not self._armed:
             return
         self._armed = False
-        self._held.clear()
-        self._ready.clear()
+        assert self._assembly is not None
+        self._assembly.forget_buffers()
         while self._taken:  # buffers popped from the stream are ours; it frees the others itself
             self._library.g_object_unref(self._taken.pop())
         try:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import subprocess
 import sys
 import time
@@ -91,10 +92,11 @@ def compile_gateware(rig: RigConfig, journal: Journal) -> None:
 @contextmanager
 def daemon(plan: DemoPlan, socket: Path) -> Iterator[subprocess.Popen[bytes]]:
     """Run ``acquire serve`` for the demo."""
-    settings = {"code.seed": plan.seed, **trigger_settings(plan)}
+    # The daemon measures the disk of its directory, and keeps a lock there that is not removed.
+    settings = {"code.seed": plan.seed, "recording.directory": str(plan.out), **trigger_settings(plan)}
     options = [f"--config={plan.config}", f"--socket={socket}"]
-    # --set takes TOML, in which numbers and quoted texts look as in Python.
-    options += [f"--set={key}={value!r}" for key, value in settings.items()]
+    # --set takes TOML, in which numbers and texts look as in JSON.
+    options += [f"--set={key}={json.dumps(value, ensure_ascii=False)}" for key, value in settings.items()]
     with daemon_process(options, plan.out / LOG) as process:
         yield process
 

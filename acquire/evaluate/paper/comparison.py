@@ -76,7 +76,7 @@ def frequency(what: str, paper: str, ours: str, found_hz: float, true_hz: float)
     return statement(what, paper, ours, by, hold=error_hz <= NEAR * true_hz)
 
 
-def faster(what: str, paper: str, ours: str, seconds: float, paper_s: float, where: str) -> Row:
+def faster(what: str, paper: str, ours: str, *, seconds: float, paper_s: float, where: str) -> Row:
     """Return the row of a time; ``where`` names the machine on which the paper measured its own."""
     ratio = paper_s / seconds
     verdict: Verdict = "better" if ratio > 1 else "worse"

@@ -151,7 +151,7 @@ class Studio:
             spatial_merge,
             temporal_merge,
             options.preset,
-            options.budget_s,
+            budget_s=options.budget_s,
             solver=options.solver,
             iterations=options.iterations,
             # a figure shows a poor result rather than none
