@@ -94,8 +94,9 @@ class Reading:
 
 
 async def _prepare(archive: Archive, reading: Reading) -> None:
-    with contextlib.suppress(AcquireError):  # whoever asks for the list is told
+    with contextlib.suppress(AcquireError):  # whoever asks for the lists is told
         await reading(archive.recordings)
+        await reading(archive.videos)
 
 
 def build_page(
@@ -111,7 +112,7 @@ def build_page(
 
     @asynccontextmanager
     async def lifespan(_: FastAPI) -> AsyncIterator[None]:
-        # The first list of hundreds of recordings takes seconds: it is made before anybody asks.
+        # The first lists of hundreds of recordings take seconds: they are made before anybody asks.
         works = (hub.run(), jobs.run(), hub.glimpser.run(), _prepare(archive, reading))
         tasks = [asyncio.create_task(each) for each in works]
         try:
