@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING
 
 from acquire.config.service import public_url
 from acquire.daemon.states import State
+from acquire.processes.rank import hold_back
 
 if TYPE_CHECKING:
     from acquire.config.service import HooksConfig
@@ -24,6 +25,7 @@ if TYPE_CHECKING:
 END_S = 2.0
 MOST_AT_ONCE = 20
 """Number of news that are sent one by one; of more only the latest."""
+_NICE = 10
 START_S = 10.0
 """Time in which `acquire.daemon.post` starts, which has a limit of its own from then on."""
 
@@ -100,6 +102,7 @@ def _call(name: str, words: list[str], text: bytes, limit_s: float, *, posts: bo
     except (OSError, ValueError) as error:  # a zero byte in a word is a ValueError
         log.warning("hook %s: %s", name, error)
         return
+    hold_back(process.pid, _NICE)
     try:
         why, _ = process.communicate(text, limit_s + START_S * posts)
     except subprocess.TimeoutExpired:
