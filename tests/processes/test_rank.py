@@ -47,7 +47,7 @@ print(shown.read_text() if shown.exists() else "")
 
 
 def test_a_child_with_a_session_of_its_own_is_held_back_as_a_whole_session() -> None:
-    """Where the kernel has autogroups, a nice child of its own session gets as much as all grabbers together."""
+    """Where the kernel has autogroups, a nice child of its own session gets as much as all grabbers."""
     with subprocess.Popen(
         [sys.executable, "-c", "input()"], stdin=subprocess.PIPE, start_new_session=True
     ) as it:
