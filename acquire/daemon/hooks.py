@@ -6,6 +6,7 @@ is given up after a timeout, and later news are sent afterwards, as far as the l
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import os
 import signal
@@ -103,6 +104,20 @@ def _call(name: str, words: list[str], text: bytes, limit_s: float, *, posts: bo
         log.warning("hook %s: %s", name, error)
         return
     hold_back(process.pid, _NICE)
+    try:
+        _converse(process, name, text, limit_s, posts=posts)
+    finally:
+        # Of one that cannot be ended, subprocess would keep them open until it ends.
+        for pipe in (process.stdin, process.stdout):
+            with contextlib.suppress(OSError):
+                if pipe is not None:
+                    pipe.close()
+
+
+def _converse(
+    process: subprocess.Popen[bytes], name: str, text: bytes, limit_s: float, *, posts: bool
+) -> None:
+    """Give ``text`` to a process, wait for its end, and log what went wrong."""
     try:
         why, _ = process.communicate(text, limit_s + START_S * posts)
     except subprocess.TimeoutExpired:

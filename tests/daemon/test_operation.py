@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import configparser
 import contextlib
+import errno
 import http.server
 import itertools
 import json
 import os
 import re
+import signal
 import socket
 import subprocess
 import sys
@@ -24,6 +26,7 @@ from waiting import until
 from acquire.cli.install_service import install_service
 from acquire.config import builtin_directory, load_rig
 from acquire.config.service import HooksConfig
+from acquire.daemon import hooks as hooks_module
 from acquire.daemon.facts import Health
 from acquire.daemon.hooks import Hooks
 from acquire.daemon.host import memory_bytes, needed_bytes
@@ -91,6 +94,32 @@ def test_a_hook_is_given_up_with_its_children(tmp_path: Path) -> None:
         assert time.monotonic() < deadline
         time.sleep(0.02)
     hooks.close()
+
+
+@pytest.mark.filterwarnings("ignore:subprocess .* is still running:ResourceWarning")
+def test_a_hook_that_cannot_be_ended_leaves_no_descriptor_behind(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    """As one that became another user. Its pipes stayed open for as long as it went on."""
+    others: list[int] = []
+
+    def refused(pid: int, number: int) -> None:
+        others.append(pid)
+        raise PermissionError(errno.EPERM, "Operation not permitted")
+
+    killpg = os.killpg
+    monkeypatch.setattr(os, "killpg", refused)
+    before = psutil.Process().num_fds()
+    try:
+        for posts in (False, True):
+            words = [sys.executable, "-c", "import time; time.sleep(300)"]
+            monkeypatch.setattr(hooks_module, "START_S", 0.0)
+            hooks_module._call("it", words, b"news" * 100_000, 0.2, posts=posts)
+        assert caplog.text.count("hook it cannot be ended") == 2
+        assert psutil.Process().num_fds() == before
+    finally:
+        for pid in others:
+            killpg(pid, signal.SIGKILL)
 
 
 def test_a_hook_stands_back(tmp_path: Path) -> None:
