@@ -156,9 +156,7 @@ def _add_session(api: APIRouter, guard: Guard, tokens: Tokens | TokenFile, *, se
         address = request.client.host if request.client else ""
         role = guard.role_of_token(asked.token, address)
         if role is None:
-            raise UsageError(
-                "the token is wrong, or this address has sent too many wrong ones", hint="acquire web --link"
-            )
+            raise UsageError("the token is wrong", hint="acquire web --link")
         # No script can read the cookie, no other site can make a browser send it, and only /api receives it.
         response.set_cookie(
             COOKIE, tokens.cookie(role), httponly=True, samesite="strict", secure=secure, path="/api"
