@@ -24,6 +24,7 @@ from acquire.camera.aravis.stream import RECEIVE_BYTES
 from acquire.cores import usable_cores
 from acquire.lines import ARMS
 from acquire.plugins import GROUPS, OURS
+from acquire.processes.rank import sessions_share
 from acquire.processes.shared import available_bytes
 
 if TYPE_CHECKING:
@@ -73,6 +74,7 @@ def examine(rig: RigConfig | None, running: str | None) -> Iterator[Finding]:
         yield Finding("processors", "warning", text, todo)
     yield _governor()
     yield _realtime(rig)
+    yield _sessions(rig)
     yield _memory(rig)
     yield from _disk(Path() if rig is None else rig.recording.directory)
     yield _clock()
@@ -154,6 +156,20 @@ def _realtime(rig: RigConfig | None) -> Finding:
     why = ", and stream.realtime asks for it" if wanted else "; without it, others may delay them"
     todo = "LimitRTPRIO=1 in the unit (acquire install-service), or rtprio in /etc/security/limits.d/"
     return Finding("real time", level, f"this user may not run grabbers in real time{why}", todo)
+
+
+def _sessions(rig: RigConfig | None) -> Finding:
+    if not sessions_share():
+        return Finding("sessions", "good", "the kernel shares the processors among processes, by their nice")
+    if rig is not None and rig.stream.realtime:
+        return Finding("sessions", "good", "grabbers in real time run ahead of all sessions")
+    return Finding(
+        "sessions",
+        "warning",
+        "the kernel shares the processors among sessions: a program in another terminal gets as much as the "
+        "whole capture, however nice it is",
+        "sysctl -w kernel.sched_autogroup_enabled=0, stream.realtime, or a service (acquire install-service)",
+    )
 
 
 def _memory(rig: RigConfig | None) -> Finding:

@@ -6,6 +6,7 @@ is given up after a timeout, and later news are sent afterwards, as far as the l
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import os
 import signal
@@ -16,6 +17,7 @@ from typing import TYPE_CHECKING
 
 from acquire.config.service import public_url
 from acquire.daemon.states import State
+from acquire.processes.rank import hold_back
 
 if TYPE_CHECKING:
     from acquire.config.service import HooksConfig
@@ -24,6 +26,7 @@ if TYPE_CHECKING:
 END_S = 2.0
 MOST_AT_ONCE = 20
 """Number of news that are sent one by one; of more only the latest."""
+_NICE = 10
 START_S = 10.0
 """Time in which `acquire.daemon.post` starts, which has a limit of its own from then on."""
 
@@ -100,6 +103,21 @@ def _call(name: str, words: list[str], text: bytes, limit_s: float, *, posts: bo
     except (OSError, ValueError) as error:  # a zero byte in a word is a ValueError
         log.warning("hook %s: %s", name, error)
         return
+    hold_back(process.pid, _NICE)
+    try:
+        _converse(process, name, text, limit_s, posts=posts)
+    finally:
+        # Of one that cannot be ended, subprocess would keep them open until it ends.
+        for pipe in (process.stdin, process.stdout):
+            with contextlib.suppress(OSError):
+                if pipe is not None:
+                    pipe.close()
+
+
+def _converse(
+    process: subprocess.Popen[bytes], name: str, text: bytes, limit_s: float, *, posts: bool
+) -> None:
+    """Give ``text`` to a process, wait for its end, and log what went wrong."""
     try:
         why, _ = process.communicate(text, limit_s + START_S * posts)
     except subprocess.TimeoutExpired:

@@ -318,6 +318,9 @@ class Status(Message):
 
     state: State
     since: datetime
+    state_s: float = Field(
+        default=0.0, description="time in this state, whatever has happened to the host's clock"
+    )
     possible: list[Text] = Field(description="commands that the state allows")
     busy: Text | None = Field(
         description="the command being carried out, and after a colon what it is waiting for"

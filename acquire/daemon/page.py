@@ -70,9 +70,11 @@ class Page:
             return
         self._begun_s = now_s
         try:
-            # In a session of its own: Ctrl-C on the terminal ends the daemon, which then ends the page.
+            # In a process group of its own: Ctrl-C on the terminal ends the daemon, which then ends the page.
+            # Not in a session of its own: a kernel with autogroups shares the processors among sessions
+            # first, and the page would get half of them, however nice it is.
             self._process = subprocess.Popen(  # noqa: S603 - this package
-                self._words, stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, start_new_session=True
+                self._words, stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, process_group=0
             )
         except OSError as error:
             log.error("the operator's page cannot be started: %s", error)  # noqa: TRY400 - no traceback

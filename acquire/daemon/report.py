@@ -67,6 +67,10 @@ class Rates:
         return min(1.0, (whites - white) / (last - first))
 
 
+def seconds_since(monotonic_s: float) -> float:
+    return round(time.monotonic() - monotonic_s, 3)
+
+
 def trigger_status(seen: CaptureStatus) -> TriggerStatus | None:
     """Return the status of the trigger."""
     if not seen.trigger:

@@ -21,7 +21,7 @@ from acquire.daemon.events import StandingOrder
 from acquire.daemon.messages import ArmRequest, LastRecording, Status, fault_error
 from acquire.daemon.news import NewsLog
 from acquire.daemon.plan import default_path, recording_of
-from acquire.daemon.report import Rates, arm_statuses, trigger_status
+from acquire.daemon.report import Rates, arm_statuses, seconds_since, trigger_status
 from acquire.daemon.salvage import Salvage
 from acquire.daemon.states import Event, State, after, commands, possible
 from acquire.daemon.take import Take
@@ -76,7 +76,7 @@ class Service:
         self._hurried = threading.Event()
         self._born = time.monotonic()
         self._state = State.IDLE
-        self._since = datetime.now(UTC)
+        self._since, self._since_s = datetime.now(UTC), time.monotonic()
         self._busy: str | None = None
         self._run: Run | None = None
         self._seen = CaptureStatus()
@@ -93,10 +93,10 @@ class Service:
 
     def status(self) -> Status:
         """Return the latest published status; never waits."""
-        uptime_s = round(time.monotonic() - self._born, 3)
         # These change even while the devices' thread waits for a device and publishes nothing.
-        update = {"uptime_s": uptime_s, "troubles": self.troubles.statuses, "disk": self._disk.status}
-        return self._status.model_copy(update=update)
+        ages = {"uptime_s": seconds_since(self._born), "state_s": seconds_since(self._since_s)}
+        others = {"troubles": self.troubles.statuses, "disk": self._disk.status}
+        return self._status.model_copy(update=ages | others)
 
     def ring_places(self) -> tuple[str | None, dict[str, tuple[str, RingShape]]]:
         """Return the run's ID, and per arm the path and shape of its ring's memory."""
@@ -457,7 +457,7 @@ class Service:
 
     def _go(self, event: Event, why: str = "") -> None:
         before, self._state = self._state, after(self._state, event)
-        self._since = datetime.now(UTC)
+        self._since, self._since_s = datetime.now(UTC), time.monotonic()
         level = logging.ERROR if event is Event.FAULT else logging.INFO
         log.log(level, "%s → %s (%s%s)", before, self._state, event, f": {why}" if why else "", extra=EACH)
         path = self._take.path if self._take else self._last.path if self._last else None

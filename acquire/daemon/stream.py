@@ -34,13 +34,42 @@ MOST_STREAMS = 16
 LEAST_STATUS_S, MOST_STATUS_S = 0.05, 60.0
 
 
+class Places:
+    """The places of the streams that are open, or will be in a moment: their number is exact at any time."""
+
+    def __init__(self) -> None:
+        # By number: a place may be given back by the garbage collector, in any thread.
+        self._taken: set[int] = set()
+
+    def __len__(self) -> int:
+        return len(self._taken)
+
+    def take(self) -> Place:
+        return Place(self._taken)
+
+
+class Place:
+    """A place, also given back when its stream is dropped before its first step."""
+
+    def __init__(self, taken: set[int]) -> None:
+        self._taken = taken
+        taken.add(id(self))
+
+    def give_back(self) -> None:
+        """Idempotent."""
+        self._taken.discard(id(self))
+
+    # A generator that was never begun reaches no `finally`, but its arguments are dropped with it.
+    __del__ = give_back
+
+
 class Streams:
     """All streams of one event loop, `MOST_STREAMS` at most."""
 
     def __init__(self, log: NewsLog, status: Callable[[], Status]) -> None:
         self._log = log
         self._status = status
-        self._open = 0
+        self._places = Places()
 
     def open(self, last_id: str | None, status_s: float | None, *, history: bool) -> AsyncIterator[str]:
         """Return the text of a stream. Raises StateError if there are too many already.
@@ -48,16 +77,16 @@ class Streams:
         ``last_id``: ID of the latest news that the client has; without one, all news that are kept come first
         if ``history``. ``status_s``: time between two statuses, which also come with every news; None: none.
         """
-        if self._open >= MOST_STREAMS:
+        if len(self._places) >= MOST_STREAMS:
             raise StateError(
                 f"{MOST_STREAMS} clients follow the news already", possible="status", hint="close one of them"
             )
         # As of the request, not of the stream's first step: news in between must not be missed.
         if last_id is None and not history:
             last_id = self._log.last_id
-        return self._stream(last_id, status_s)
+        return self._stream(self._places.take(), last_id, status_s)
 
-    async def _stream(self, last_id: str | None, status_s: float | None) -> AsyncIterator[str]:
+    async def _stream(self, place: Place, last_id: str | None, status_s: float | None) -> AsyncIterator[str]:
         loop, woken = asyncio.get_running_loop(), asyncio.Event()
 
         def wake() -> None:
@@ -65,7 +94,6 @@ class Streams:
                 loop.call_soon_threadsafe(woken.set)
 
         # Not in `open`: a stream that is never begun would never reach `finally`.
-        self._open += 1
         self._log.listen(wake)
         due_s, begins = time.monotonic(), True
         try:
@@ -86,7 +114,7 @@ class Streams:
                 begins = False
                 await wait(woken, ALIVE_S if status_s is None else min(ALIVE_S, max(0.0, due_s - now_s)))
         finally:
-            self._open -= 1
+            place.give_back()
             self._log.forget(wake)
 
 

@@ -6,6 +6,10 @@
     back        what can be repeated: the page, its jobs, copies, recoveries
 
 Threads and processes that are started later inherit a rank.
+
+Kernels with autogroups share the processors among sessions first (setsid(2), so every terminal is one), and
+nice counts only within a session: what stands back must be in the session of the grabbers. Services of
+systemd have no autogroups.
 """
 
 from __future__ import annotations
@@ -88,3 +92,31 @@ def stand_back(nice: int, oom_score: int) -> None:
         os.sched_setscheduler(0, os.SCHED_BATCH, os.sched_param(0))
     with contextlib.suppress(OSError):  # refused there, too, or unknown to the kernel
         Path("/proc/self/oom_score_adj").write_text(str(oom_score), encoding="ascii")
+
+
+def hold_back(pid: int, nice: int) -> None:
+    """Lower the rank of a child that has a session of its own, and of all that it starts from now on."""
+    lower = min(19, os.getpriority(os.PRIO_PROCESS, 0) + nice)
+    with contextlib.suppress(OSError):  # it has ended, has become another user, or there are no autogroups
+        os.setpriority(os.PRIO_PROCESS, pid, lower)
+        Path(f"/proc/{pid}/autogroup").write_text(str(lower), encoding="ascii")
+
+
+def sessions_share(proc: Path = Path("/proc"), groups: Path = Path("/sys/fs/cgroup")) -> bool:
+    """Whether the kernel shares the processors among sessions here: see the module."""
+    try:
+        if (proc / "sys/kernel/sched_autogroup_enabled").read_text(encoding="ascii").strip() != "1":
+            return False
+        lines = (proc / "self/cgroup").read_text(encoding="utf-8").splitlines()
+    except OSError:
+        return False
+    # Autogroups are for processes in no control group for processors: hierarchy, controllers, path.
+    for _, controllers, path in (line.split(":", 2) for line in lines):
+        if "cpu" in controllers.split(","):
+            return path == "/"
+        if not controllers and any(
+            (groups / part.lstrip("/") / "cpu.weight").exists()
+            for part in (path, *map(str, Path(path).parents))
+        ):
+            return False
+    return True

@@ -34,15 +34,15 @@ _SHOWN_BY = {
 """Kinds of groups that are ours and no recordings, as their formats name them, and what shows them."""
 
 
-def opened(source: Source, kind: type[Kind]) -> Kind:
+def opened(source: Source, kind: type[Kind], document: Document | None = None) -> Kind:
     """Open a source as a `Recording`, or as an `Outline`, which has no lines.
 
-    Raises PlaceError if there is no recording, DataError if it is damaged, and StoreError if that cannot be
-    found out.
+    ``document``: its root, if it has just been read. Raises PlaceError if there is no recording, DataError
+    if it is damaged, and StoreError if that cannot be found out.
     """
     # The format comes first: something other than a recording is a wrong path, and not damage.
-    document = read_root(source)
-    name = _format(document)
+    document = read_root(source) if document is None else document
+    name = stated_format(document)
     if name not in READABLE:
         if name is not None and name.startswith(READABLE[0].split("/")[0] + "/"):
             raise PlaceError(
@@ -71,7 +71,7 @@ def opened(source: Source, kind: type[Kind]) -> Kind:
 
 def format_of(place: Path | str) -> str | None:
     """Return the format that a Zarr group states, if any. Raises as `read_root` does."""
-    return _format(read_root(source_of(place)))
+    return stated_format(read_root(source_of(place)))
 
 
 def other_kind(name: str | None) -> str | None:
@@ -123,7 +123,8 @@ def _check_object(attributes: Any) -> None:
         raise TypeError("its attributes are not a JSON object")
 
 
-def _format(document: Document) -> str | None:
+def stated_format(document: Document) -> str | None:
+    """Return the format that a root document states, if any."""
     name = document["attributes"].get("format")
     return name if isinstance(name, str) else None
 

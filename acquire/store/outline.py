@@ -29,9 +29,12 @@ if TYPE_CHECKING:
     from acquire.store.table_reader import Event, Gap
 
 
-def open_outline(place: Path | str) -> Outline:
-    """Open a recording without its lines; raises as `acquire.store.open_recording` does."""
-    return opened(source_of(place), Outline)
+def open_outline(place: Path | str, document: Document | None = None) -> Outline:
+    """Open a recording without its lines; raises as `acquire.store.open_recording` does.
+
+    ``document``: its root, if it has just been read.
+    """
+    return opened(source_of(place), Outline, document)
 
 
 class Outline:

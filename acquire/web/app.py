@@ -94,8 +94,9 @@ class Reading:
 
 
 async def _prepare(archive: Archive, reading: Reading) -> None:
-    with contextlib.suppress(AcquireError):  # whoever asks for the list is told
+    with contextlib.suppress(AcquireError):  # whoever asks for the lists is told
         await reading(archive.recordings)
+        await reading(archive.videos)
 
 
 def build_page(
@@ -111,7 +112,7 @@ def build_page(
 
     @asynccontextmanager
     async def lifespan(_: FastAPI) -> AsyncIterator[None]:
-        # The first list of hundreds of recordings takes seconds: it is made before anybody asks.
+        # The first lists of hundreds of recordings take seconds: they are made before anybody asks.
         works = (hub.run(), jobs.run(), hub.glimpser.run(), _prepare(archive, reading))
         tasks = [asyncio.create_task(each) for each in works]
         try:
@@ -155,9 +156,7 @@ def _add_session(api: APIRouter, guard: Guard, tokens: Tokens | TokenFile, *, se
         address = request.client.host if request.client else ""
         role = guard.role_of_token(asked.token, address)
         if role is None:
-            raise UsageError(
-                "the token is wrong, or this address has sent too many wrong ones", hint="acquire web --link"
-            )
+            raise UsageError("the token is wrong", hint="acquire web --link")
         # No script can read the cookie, no other site can make a browser send it, and only /api receives it.
         response.set_cookie(
             COOKIE, tokens.cookie(role), httponly=True, samesite="strict", secure=secure, path="/api"

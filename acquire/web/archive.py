@@ -8,6 +8,8 @@ from __future__ import annotations
 
 import stat
 from collections import OrderedDict
+from contextlib import suppress
+from dataclasses import dataclass
 from io import BytesIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -19,7 +21,6 @@ from acquire.errors import AcquireError, PlaceError, UsageError
 from acquire.flags import ARMS, NO_IMAGE
 from acquire.store import (
     Recording,
-    format_of,
     hold,
     open_outline,
     open_recording,
@@ -27,8 +28,10 @@ from acquire.store import (
     taint_words,
 )
 from acquire.store.layout import DAMAGE
+from acquire.store.opening import read_root, stated_format
 from acquire.store.refusals import refused
 from acquire.store.shortfall import first_shortfall, missing_segments
+from acquire.store.source import source_of
 from acquire.text import shortened
 from acquire.web.messages import (
     EventFacts,
@@ -41,9 +44,12 @@ from acquire.web.messages import (
 )
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
+
     from numpy.typing import NDArray
 
     from acquire.store import Outline, VideoFile
+    from acquire.store.layout import Document
 
 MOST_LISTED = 500
 """Largest number of entries in a list; the newest are listed."""
@@ -67,9 +73,9 @@ class Archive:
     def __init__(self, directory: Path) -> None:
         self._directory = directory
         self._pictures: OrderedDict[tuple[Any, ...], bytes] = OrderedDict()
-        self._facts: dict[str, tuple[_Stamp, RecordingFacts]] = {}
+        self._facts: dict[str, tuple[_Stamp, RecordingFacts | VideoFacts]] = {}
         self._kinds: dict[str, tuple[_Stamp, bool]] = {}
-        """Name → its root document, and whether it is a video. Like the facts: of what was listed last."""
+        """Name → its root document, and whether it is a video. As the facts, of what is in the directory."""
         self._ranges: OrderedDict[tuple[str, int], tuple[float, float]] = OrderedDict()
 
     def path_of(self, name: str, suffix: str = ".zarr") -> Path:
@@ -90,11 +96,7 @@ class Archive:
 
     def recordings(self) -> list[RecordingFacts]:
         """Return the recordings, newest first."""
-        entries = self._entries(video=False)
-        listed = [self._known_facts(path) for path in entries]
-        # Recordings come and go for weeks.
-        self._facts = {path.name: self._facts[path.name] for path in entries if path.name in self._facts}
-        return listed
+        return [self._recording_facts(entry) for entry in self._entries(video=False)]
 
     def recording(self, name: str) -> RecordingDetail:
         """Return a recording with its events, gaps and holds. Raises PlaceError and DataError."""
@@ -135,13 +137,7 @@ class Archive:
 
     def videos(self) -> list[VideoFacts]:
         """Return the videos, newest first."""
-        listed = []
-        for path in self._entries(video=True):
-            try:
-                listed.append(_video_facts(path.name, open_video(path)))
-            except AcquireError as error:
-                listed.append(VideoFacts(name=path.name, error=shortened(error.message, 300)))
-        return listed
+        return [self._video_facts(entry) for entry in self._entries(video=True)]
 
     def video(self, name: str) -> VideoFacts:
         """Return a video with its display range. Raises PlaceError and DataError."""
@@ -173,52 +169,86 @@ class Archive:
         content: bytes = np.clip(scaled, 0, 255).astype(np.uint8).tobytes()
         return content
 
-    def _entries(self, *, video: bool) -> list[Path]:
-        """Return the directory's videos or recordings, newest first."""
-        found = []
+    def _entries(self, *, video: bool) -> Iterator[_Entry]:
+        """Yield the directory's newest videos or recordings, newest first, `MOST_LISTED` at most.
+
+        One after the other, so that no more than one root document is kept in memory.
+        """
+        there = {}
         try:
-            entries = list(self._directory.iterdir())
+            paths = list(self._directory.iterdir())
         except OSError as error:
             raise PlaceError(f"{self._directory} cannot be listed: {error.strerror}") from error
-        kinds = {}
-        # Links are left out: lstat never reports one as a directory.
-        for path in entries:
-            try:
+        for path in paths:
+            # Links are left out: lstat never reports one as a directory.
+            with suppress(OSError):
                 mode = path.lstat()
-            except OSError:
-                continue
-            if path.suffix != ".zarr" or not stat.S_ISDIR(mode.st_mode):
-                continue
-            stamp = _stamp(path)
-            known = self._kinds.get(path.name)
-            # A page asks for both lists every three seconds, and there may be thousands of entries.
-            if known is None or known[0] != stamp or stamp is None:
-                try:
-                    known = stamp, (format_of(path) or "").startswith(VIDEO)
-                except AcquireError:
-                    known = stamp, False  # it is then listed among the recordings, with the error
-            kinds[path.name] = known
-            if known[1] is video:
-                found.append((mode.st_mtime_ns, path))
-        self._kinds = kinds
-        return [path for _, path in sorted(found, reverse=True)[:MOST_LISTED]]
+                if path.suffix == ".zarr" and stat.S_ISDIR(mode.st_mode):
+                    there[path.name] = mode.st_mtime_ns, path
+        # Recordings come and go for weeks.
+        self._kinds = {name: known for name, known in self._kinds.items() if name in there}
+        self._facts = {name: known for name, known in self._facts.items() if name in there}
+        left = MOST_LISTED
+        for _, path in sorted(there.values(), reverse=True):
+            entry, is_video = self._entry(path)
+            if is_video is video:
+                yield entry
+                left -= 1
+                if not left:
+                    return
 
-    def _known_facts(self, path: Path) -> RecordingFacts:
+    def _entry(self, path: Path) -> tuple[_Entry, bool]:
+        """Return an entry, and whether it is a video."""
+        entry = _Entry(path, _stamp(path))
+        known = self._kinds.get(path.name)
+        # A page asks for both lists every three seconds, and there may be thousands of entries.
+        if known is not None and known[0] == entry.stamp and entry.stamp is not None:
+            return entry, known[1]
+        is_video = False  # also of one that cannot be read: it is listed among the recordings, with the error
+        with suppress(AcquireError):
+            entry.root = read_root(source_of(path))
+            is_video = (stated_format(entry.root) or "").startswith(VIDEO)
+        self._kinds[path.name] = entry.stamp, is_video
+        self._facts.pop(path.name, None)
+        return entry, is_video
+
+    def _recording_facts(self, entry: _Entry) -> RecordingFacts:
         """Return a recording's facts, from the cache if it is sealed and unchanged."""
-        stamp = _stamp(path)
-        before = self._facts.get(path.name)
-        if before is not None and before[0] == stamp and stamp is not None:
+        path, before = entry.path, self._facts.get(entry.path.name)
+        if before is not None and before[0] == entry.stamp and isinstance(before[1], RecordingFacts):
             return before[1]
         try:
-            known = _facts(path, open_outline(path))
+            known = _facts(path, open_outline(path, entry.root))
         except AcquireError as error:
             return RecordingFacts(name=path.name, error=shortened(error.message, 300))
         except (*DAMAGE, MemoryError) as error:
             return RecordingFacts(name=path.name, error=f"cannot be read: {shortened(error, 300)}")
         # A recording that is being written changes more often than its root document does.
-        if known.state == "sealed":
-            self._facts[path.name] = stamp, known
+        if known.state == "sealed" and entry.stamp is not None:
+            self._facts[path.name] = entry.stamp, known
         return known
+
+    def _video_facts(self, entry: _Entry) -> VideoFacts:
+        """Return a video's facts, from the cache if it is unchanged: a video appears as a whole."""
+        path, before = entry.path, self._facts.get(entry.path.name)
+        if before is not None and before[0] == entry.stamp and isinstance(before[1], VideoFacts):
+            return before[1]
+        try:
+            known = _video_facts(path.name, open_video(path))
+        except AcquireError as error:
+            return VideoFacts(name=path.name, error=shortened(error.message, 300))
+        if entry.stamp is not None:
+            self._facts[path.name] = entry.stamp, known
+        return known
+
+
+@dataclass(slots=True)
+class _Entry:
+    """An entry of the directory, with its root document if that had to be read just now."""
+
+    path: Path
+    stamp: _Stamp
+    root: Document | None = None
 
 
 def _stamp(path: Path) -> _Stamp:

@@ -153,11 +153,12 @@ class Guard:
         return self._refusal_of_role(request, address)
 
     def _refusal_of_role(self, request: Request, address: str) -> JSONResponse | None:
-        # Before the token is compared, so that guessing on yields nothing, not even with the right one.
-        if not self._wrong.has_room(address):
-            return _refuse(429, "too many wrong tokens came from this address", "again in a few seconds")
         role = self.role_of(request)
         if role is None:
+            # The right token is let in nevertheless. It is too long to be guessed, and others of its address,
+            # such as all users of this host or of one proxy, could lock the operator out.
+            if not self._wrong.has_room(address):
+                return _refuse(429, "too many wrong tokens came from this address", "again in a few seconds")
             # Only an explicit token counts as a guess: a page whose cookie has expired repeats its requests.
             if "authorization" in request.headers:
                 self.note_wrong(address)
@@ -178,17 +179,15 @@ class Guard:
         return self._tokens.role_of_cookie(request.cookies.get(COOKIE, ""))
 
     def role_of_token(self, token: str, address: str) -> Role | None:
-        """Return the role of a token; also None if the address has tried too many wrong ones."""
-        if not self._wrong.has_room(address):
-            return None
+        """Return the role of a token; None for a wrong one."""
         role = self._tokens.role_of_token(token)
         if role is None:
             self.note_wrong(address)
         return role
 
     def note_wrong(self, address: str) -> None:
-        self._wrong.take(address)
-        log.warning("a wrong token from %s", address)
+        if self._wrong.take(address):  # others are not worth an entry each
+            log.warning("a wrong token from %s", address)
 
 
 def _refuse(status: int, text: str, hint: str = "") -> JSONResponse:

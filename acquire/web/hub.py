@@ -53,7 +53,7 @@ class Hub:
         self.connected = False
         self.why = "the daemon has not answered yet"
         self._heard_s = time.monotonic()
-        self._armed_s = time.monotonic()
+        self._armed_s = self._status_s = time.monotonic()
         self._news: deque[tuple[int, bytes]] = deque(maxlen=MOST_NEWS)
         self._count = 0
         self._version = 0
@@ -98,8 +98,9 @@ class Hub:
         if version == self._version and time.monotonic() - made_s < KEPT_S:
             return made
         status, health = self.status.model_dump_json(), self.health().model_dump_json()
-        # The browser's own clock may be wrong: how old a state is follows from ours.
-        facts = f'{{"now_ms":{time.time_ns() // 1_000_000},"status":{status},"health":{health}}}'
+        # No clock's time: the browser's may be wrong, and the host's may be set at any moment.
+        for_s = self.status.state_s + time.monotonic() - self._status_s
+        facts = f'{{"for_s":{for_s:.3f},"status":{status},"health":{health}}}'
         made = json_message("state", facts)
         self._made = self._version, time.monotonic(), made
         return made
@@ -139,7 +140,7 @@ class Hub:
             elif item is not None:
                 if not self.connected:
                     log.info("connected to the daemon (process %d)", item.pid)
-                self.connected, self.status = True, item
+                self.connected, self.status, self._status_s = True, item, self._heard_s
                 self.live.turn_s = RECORDING_TURN_S if self.is_recording else TURN_S
                 self._version += 1
                 if item.run_id != self._run_id:  # each run has its own rings

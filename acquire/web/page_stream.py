@@ -10,12 +10,13 @@ import asyncio
 import time
 from typing import TYPE_CHECKING
 
-from acquire.daemon.stream import wait
+from acquire.daemon.stream import Places, wait
 from acquire.errors import StateError
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
 
+    from acquire.daemon.stream import Place
     from acquire.web.hub import Hub
 
 MOST_PAGES = 24
@@ -31,24 +32,23 @@ class Pages:
 
     def __init__(self, hub: Hub) -> None:
         self._hub = hub
-        self._open = 0
+        self._places = Places()
 
     def open(self, *, pictures: bool, glimpses: bool) -> AsyncIterator[bytes]:
         """Return a page's messages (`acquire.web.frames`). Raises StateError if there are too many pages."""
-        if self._open >= MOST_PAGES:
+        if len(self._places) >= MOST_PAGES:
             raise StateError(f"{MOST_PAGES} pages are open already", hint="close one of them")
-        return self._stream(pictures=pictures, glimpses=glimpses)
+        return self._stream(self._places.take(), pictures=pictures, glimpses=glimpses)
 
     @property
     def state(self) -> bytes:
         return self._hub.state_message()
 
-    async def _stream(self, *, pictures: bool, glimpses: bool) -> AsyncIterator[bytes]:
+    async def _stream(self, place: Place, *, pictures: bool, glimpses: bool) -> AsyncIterator[bytes]:
         hub = self._hub
         # Not in `open`: a stream that is never begun would never reach `finally`.
-        self._open += 1
         woken = hub.listen()
-        place = hub.live.watch() if pictures else 0
+        next_row = hub.live.watch() if pictures else 0
         # News start with the oldest that is kept: a page that is opened later shows earlier events, too.
         next_news, version, state_s, glimpse = 0, -1, 0.0, hub.glimpser.number
         if glimpses:
@@ -65,7 +65,7 @@ class Pages:
                     parts.append(hub.state_message())
                 parts += news
                 if pictures:
-                    place, rows = hub.live.after(place)
+                    next_row, rows = hub.live.after(next_row)
                     parts += rows
                 if glimpses and hub.glimpser.number != glimpse:
                     glimpse = hub.glimpser.number
@@ -76,7 +76,7 @@ class Pages:
                 await asyncio.sleep(LEAST_S)
                 await wait(woken, STATE_S - LEAST_S)
         finally:
-            self._open -= 1
+            place.give_back()
             hub.forget(woken)
             if pictures:
                 hub.live.leave()

@@ -41,6 +41,8 @@ def serve_page(socket: Path, directory: Path, config: WebConfig) -> None:
     Raises UsageError for an address, certificate or token file that cannot be used.
     """
     stand_back(NICE, EARLY)
+    # It is in the background of the daemon's terminal: with `stty tostop`, its log would stop it.
+    signal.signal(signal.SIGTTOU, signal.SIG_IGN)
     raise_descriptor_limit()
     tokens = TokenFile(config.token_path(socket))
     context = None

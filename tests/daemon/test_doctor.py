@@ -57,6 +57,15 @@ def test_limits_are_judged_by_what_the_rig_asks_for(tmp_path: Path, monkeypatch:
     assert "LimitNOFILE" in found(None, "descriptors").todo
 
 
+def test_sessions_that_share_the_processors_are_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(doctor, "sessions_share", lambda: True)
+    one = found(rig_config(tmp_path), "sessions")
+    assert (one.level, "sched_autogroup_enabled=0" in one.todo) == ("warning", True)
+    assert found(rig_config(tmp_path, **{"stream.realtime": True}), "sessions").level == "good"
+    monkeypatch.setattr(doctor, "sessions_share", lambda: False)
+    assert found(rig_config(tmp_path), "sessions").level == "good"
+
+
 def test_memory_is_held_against_the_rings(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert found(rig_config(tmp_path), "memory").level == "good"
     monkeypatch.setattr(doctor, "available_bytes", lambda: 10**6)

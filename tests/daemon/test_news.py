@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import asyncio
+from collections.abc import AsyncIterator
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import pytest
 from fake_run import FakeRun, rig_config
@@ -21,7 +23,10 @@ from acquire.daemon.messages import (
 from acquire.daemon.news import LOSSES_EVERY_S, Changes, NewsLog
 from acquire.daemon.service import Service
 from acquire.daemon.states import State
+from acquire.daemon.stream import ALIVE, MOST_STREAMS, Streams
+from acquire.errors import StateError
 from acquire.stream.messages import Note
+from acquire.web.page_stream import MOST_PAGES, Pages
 
 
 def arm_status(lost: int = 0, fill: int = 0, verdict: str = "verified", **more: Any) -> ArmStatus:
@@ -215,3 +220,36 @@ def test_health_is_one_word_and_one_sentence(seen: Status, level: str, words: st
 
 def test_a_rate_is_not_judged_before_it_is_known() -> None:
     assert health_of(status(arm_status(rate_hz=0.0)), 1000.0, age_s=1.0).level == "good"
+
+
+def test_places_of_streams_are_taken_at_once_and_given_back_with_them() -> None:
+    """A place was taken by a stream's first step: of requests in one moment, more than the limit got in."""
+    streams = Streams(NewsLog(), lambda: status(arm_status()))
+
+    def opened() -> AsyncIterator[str]:
+        return streams.open(None, None, history=False)
+
+    kept = [opened() for _ in range(MOST_STREAMS)]
+    with pytest.raises(StateError, match="16 clients follow the news already"):
+        opened()
+    kept.pop()  # dropped before its first step
+    kept.append(opened())
+
+    async def begun() -> None:
+        stream = kept.pop()
+        assert await anext(stream) == ALIVE
+        with pytest.raises(StateError):
+            opened()
+        await stream.aclose()  # type: ignore[attr-defined]
+        kept.append(opened())
+
+    asyncio.run(begun())
+
+
+def test_places_of_pages_are_taken_at_once() -> None:
+    pages = Pages(cast("Any", None))
+    kept = [pages.open(pictures=False, glimpses=False) for _ in range(MOST_PAGES)]
+    with pytest.raises(StateError, match="24 pages are open already"):
+        pages.open(pictures=False, glimpses=False)
+    kept.pop()
+    kept.append(pages.open(pictures=False, glimpses=False))

@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import configparser
 import contextlib
+import errno
 import http.server
 import itertools
 import json
+import os
 import re
+import signal
 import socket
 import subprocess
 import sys
@@ -23,12 +26,14 @@ from waiting import until
 from acquire.cli.install_service import install_service
 from acquire.config import builtin_directory, load_rig
 from acquire.config.service import HooksConfig
+from acquire.daemon import hooks as hooks_module
 from acquire.daemon.facts import Health
 from acquire.daemon.hooks import Hooks
 from acquire.daemon.host import memory_bytes, needed_bytes
 from acquire.daemon.messages import ArmRequest
 from acquire.daemon.metrics import metrics_text
 from acquire.daemon.news import NewsLog
+from acquire.daemon.page import Page
 from acquire.daemon.reload import changes, words
 from acquire.daemon.service import Service
 from acquire.daemon.setup import setup_of
@@ -89,6 +94,59 @@ def test_a_hook_is_given_up_with_its_children(tmp_path: Path) -> None:
         assert time.monotonic() < deadline
         time.sleep(0.02)
     hooks.close()
+
+
+@pytest.mark.filterwarnings("ignore:subprocess .* is still running:ResourceWarning")
+def test_a_hook_that_cannot_be_ended_leaves_no_descriptor_behind(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    """As one that became another user. Its pipes stayed open for as long as it went on."""
+    others: list[int] = []
+
+    def refused(pid: int, number: int) -> None:
+        others.append(pid)
+        raise PermissionError(errno.EPERM, "Operation not permitted")
+
+    killpg = os.killpg
+    monkeypatch.setattr(os, "killpg", refused)
+    before = psutil.Process().num_fds()
+    try:
+        for posts in (False, True):
+            words = [sys.executable, "-c", "import time; time.sleep(300)"]
+            monkeypatch.setattr(hooks_module, "START_S", 0.0)
+            hooks_module._call("it", words, b"news" * 100_000, 0.2, posts=posts)
+        assert caplog.text.count("hook it cannot be ended") == 2
+        assert psutil.Process().num_fds() == before
+    finally:
+        for pid in others:
+            killpg(pid, signal.SIGKILL)
+
+
+def test_a_hook_stands_back(tmp_path: Path) -> None:
+    """It may compute for as long as its timeout, in a session of its own."""
+    log, told = NewsLog(), tmp_path / "told"
+    code = f"import os; input(); open({str(told)!r}, 'a').write(str(os.getpriority(os.PRIO_PROCESS, 0)))"
+    hooks = Hooks(HooksConfig(command=(sys.executable, "-c", code)), log, "rig")
+    log.add("loss", "arm a lost 5 lines: camera", level="error", lines=5)
+    until(lambda: told.exists() and told.read_text() != "")
+    hooks.close()
+    assert int(told.read_text()) == min(19, os.getpriority(os.PRIO_PROCESS, 0) + 10)
+
+
+def test_the_page_is_in_the_session_of_the_daemon_but_not_interrupted_with_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """In one of its own, a kernel with autogroups gave it half of the processors, however nice it was."""
+    words = [sys.executable, "-c", "import sys; sys.stdin.read()"]
+    monkeypatch.setattr(Page, "_command", lambda *_: words)
+    page = Page(tmp_path / "c.sock")
+    try:
+        page.poll(rig_config(tmp_path, web={}))
+        assert page.pid is not None
+        assert os.getsid(page.pid) == os.getsid(0)
+        assert os.getpgid(page.pid) == page.pid
+    finally:
+        page.close()
 
 
 def test_a_webhook_gets_json() -> None:

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from live_daemon import LINE_RATE_HZ, SUBSTEPS, Daemon, acquire
+from live_daemon import END_S, LINE_RATE_HZ, SUBSTEPS, Daemon, acquire
 from waiting import until
 
 from acquire.config import load_rig
@@ -117,10 +117,13 @@ def test_takes_of_one_run_reach_back_and_every_line_is_accounted_for_once_idle(d
     """The second take holds lines of the first as well; what the ring does not hold any more is refused."""
     with daemon.client() as client:
         client.arm()
-        client.start(daemon.home / "take-1.zarr", duration_s=2.0)
-        first = client.wait(SEALED, 30)
-        second = client.start(daemon.home / "take-2.zarr", pre_s=2.0, post_s=0.05)
-        again = client.wait(SEALED, 30)
+        client.start(daemon.home / "take-1.zarr", duration_s=4.0)
+        first = client.wait(SEALED, END_S)
+        # Into the second half of the first, however long a busy host took since its end.
+        begun = open_recording(daemon.home / "take-1.zarr").first_line
+        back = client.status().arms["a"].delivered - (begun + 2.0 * LINE_RATE_HZ)
+        second = client.start(daemon.home / "take-2.zarr", pre_s=back / LINE_RATE_HZ, post_s=0.05)
+        again = client.wait(SEALED, END_S)
         assert (first.run_id, again.run_id) == (second.run_id, second.run_id)
         with pytest.raises(UsageError, match="which both rings hold now"):
             client.start(daemon.home / "take-3.zarr", pre_s=3600)

@@ -133,18 +133,22 @@ def read_lines(camera: Camera, lines: int, timeout_s: float = 300.0) -> list[np.
     return blocks
 
 
+PATIENCE_S = 300.0
+"""Against hanging: the first camera waits for pulses while the second one's process is being started."""
+
+
 def camera_child(opener: CameraOpener, link: Connection) -> None:
     """Arm, say so, read a few blocks, be told the number of pulses, read the rest, send everything."""
     camera = opener()
     camera.arm()
     link.send("armed")
-    early = camera.next_block(20.0)
+    early = camera.next_block(PATIENCE_S)
     assert early is not None
-    assert link.poll(20.0)
+    assert link.poll(PATIENCE_S)
     pulses = link.recv()
     blocks = [early.pixels]
     while sum(map(len, blocks)) < pulses:
-        block = camera.next_block(20.0)
+        block = camera.next_block(PATIENCE_S)
         assert block is not None
         blocks.append(block.pixels)
     after = camera.next_block(0.01)

@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from sim_helpers import (
     CODE,
     LEDS,
+    PATIENCE_S,
     ManualClock,
     Pulses,
     blas_child,
@@ -261,7 +262,7 @@ def spawned(target, *openers):
 
 
 def received(link):
-    assert link.poll(60), "nothing came from the child"
+    assert link.poll(PATIENCE_S), "nothing came from the child"
     return link.recv()
 
 
@@ -273,8 +274,8 @@ def test_two_cameras_in_separate_processes_follow_one_trigger():
         assert [received(link) for link in links] == ["armed", "armed"]
         trigger.prepare(trigger_run())
         trigger.start()
-        tags = trigger.tags(5.0)
-        while tags[-1].line < 4000:
+        tags = []
+        while not tags or tags[-1].line < 4000:  # on a busy host none may have come yet
             tags += trigger.tags(5.0)
         pulses = trigger.stop()
         trigger.close()

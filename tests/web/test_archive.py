@@ -20,10 +20,13 @@ from acquire.store import (
     RecordingSpec,
     RecordingWriter,
     RunCondition,
-    format_of,
     open_recording,
+    opening,
+    video,
     write_video,
 )
+from acquire.store.layout import Document
+from acquire.store.source import Source
 from acquire.stream.tagger import Tagger
 from acquire.trigger.base import TriggerRun
 from acquire.web import archive as archive_module
@@ -114,7 +117,7 @@ def test_a_video_of_which_nothing_was_written_is_black(tmp_path: Path) -> None:
 def test_lists_read_what_has_changed_and_remember_what_is_listed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Each list read the roots of all entries, every three seconds: with 1000, 0.3 cores."""
+    """Each list read the roots of all entries, every three seconds: with 1000, 0.3 cores. And each twice."""
     for number in range(3):
         with RecordingWriter.create(tmp_path / f"run-{number}.zarr", recording_spec(LOAD, CLOCK)) as writer:
             writer.seal(RunCondition.GOOD, "stopped", {})
@@ -123,17 +126,20 @@ def test_lists_read_what_has_changed_and_remember_what_is_listed(
         tmp_path / "film.zarr", frames, np.arange(4), pixel_size=1.0, frame_interval_ns=1.0, provenance={}
     )
     read: list[str] = []
+    read_root = opening.read_root
 
-    def noted(path: Path) -> str | None:
-        read.append(path.name)
-        return format_of(path)
+    def noted(source: Source) -> Document:
+        read.append(Path(str(source)).name)
+        return read_root(source)
 
-    monkeypatch.setattr(archive_module, "format_of", noted)
+    for module in (archive_module, opening, video):
+        monkeypatch.setattr(module, "read_root", noted)
     archive = Archive(tmp_path)
     assert [(one.name, one.error) for one in archive.recordings()] == [
         (f"run-{number}.zarr", None) for number in (2, 1, 0)
     ]
-    assert len(read) == 4
+    assert sorted(read) == ["film.zarr", "run-0.zarr", "run-1.zarr", "run-2.zarr"]
+    assert [one.name for one in archive.videos()] == ["film.zarr"]
     read.clear()
     assert [one.name for one in archive.videos()] == ["film.zarr"]
     assert len(archive.recordings()) == 3
@@ -143,6 +149,22 @@ def test_lists_read_what_has_changed_and_remember_what_is_listed(
     shutil.rmtree(tmp_path / "run-2.zarr")
     shutil.move(tmp_path / "film.zarr", tmp_path / "run-2.zarr")
     assert [one.name for one in archive.recordings()] == ["run-1.zarr"]
-    assert set(read) == {"run-1.zarr", "run-2.zarr"}
+    assert sorted(read) == ["run-1.zarr", "run-2.zarr"]
     assert set(archive._facts) == {"run-1.zarr"}
     assert set(archive._kinds) == {"run-1.zarr", "run-2.zarr"}
+
+
+def test_only_the_newest_are_listed_and_older_ones_are_not_read(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for number in range(5):
+        path = tmp_path / f"run-{number}.zarr"
+        with RecordingWriter.create(path, recording_spec(LOAD, CLOCK)) as writer:
+            writer.seal(RunCondition.GOOD, "stopped", {})
+        os.utime(path, ns=(number, number))
+    monkeypatch.setattr(archive_module, "MOST_LISTED", 2)
+    archive = Archive(tmp_path)
+    assert [one.name for one in archive.recordings()] == ["run-4.zarr", "run-3.zarr"]
+    assert set(archive._kinds) == {"run-4.zarr", "run-3.zarr"}
+    assert archive.videos() == []  # for which all are looked at, once
+    assert len(archive._kinds) == 5

@@ -4,15 +4,21 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import json
+import time
 from collections.abc import Callable
+from datetime import UTC, datetime, timedelta, tzinfo
 from pathlib import Path
 
+import pytest
 from fake_run import FakeRun, rig_config
 from served import api
 
 from acquire.client import AsyncClient
+from acquire.daemon import service as service_module
 from acquire.daemon.endpoint import Endpoint
 from acquire.daemon.service import Service
+from acquire.web.frames import HEAD
 from acquire.web.hub import Hub
 from acquire.web.live import RECORDING_TURN_S, TURN_S, Live
 
@@ -47,3 +53,40 @@ def test_pages_get_the_same_message_and_fewer_pictures_during_a_recording(tmp_pa
 
     with contextlib.closing(Endpoint(socket)) as endpoint, api(service, endpoint):
         asyncio.run(follow())
+
+
+def test_how_long_a_state_lasts_does_not_follow_a_clock_that_is_set(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The page counted from the host's time at the change of state: years, or nothing for hours."""
+
+    class Later(datetime):
+        @classmethod
+        def now(cls, tz: tzinfo | None = None) -> datetime:
+            return datetime.now(tz) + timedelta(days=400)
+
+    service, socket = Service(rig_config(tmp_path), lambda _: FakeRun()), tmp_path / "c.sock"
+
+    async def follow() -> None:
+        hub = Hub(socket, Live)
+        running = asyncio.create_task(hub.run())
+        client = AsyncClient(socket)
+        try:
+            monkeypatch.setattr(service_module, "datetime", Later)
+            before_s = time.monotonic()
+            await client.arm()
+            async with asyncio.timeout(60):
+                while hub.status is None or hub.status.state != "armed":
+                    await asyncio.sleep(0.01)
+            await asyncio.sleep(0.2)
+            content = hub.state_message()
+            head, _ = HEAD.unpack(content[: HEAD.size])
+            told_s = json.loads(content[HEAD.size :][:head])["state"]["for_s"]
+            assert 0.2 <= told_s <= time.monotonic() - before_s
+        finally:
+            running.cancel()
+            await asyncio.gather(running, return_exceptions=True)
+
+    with contextlib.closing(Endpoint(socket)) as endpoint, api(service, endpoint):
+        asyncio.run(follow())
+        assert service.status().since > datetime.now(UTC) + timedelta(days=399)

@@ -56,7 +56,7 @@ link.addEventListener("news", ({ detail }) => {
 link.addEventListener("rows", ({ detail }) => { watch.rows(detail.header, detail.body); aim.rows(detail.header, detail.body); });
 link.addEventListener("state", ({ detail }) => {
   latest = detail.header.state;
-  band.show(latest.status, latest.health, latest.now_ms);
+  band.show(latest.status, latest.health, latest.for_s);
   watch.show(latest.status);
   aim.show(latest.status);
   calibrate.show(latest.status);

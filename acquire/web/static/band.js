@@ -14,8 +14,8 @@ export class Band {
     $("acknowledge").addEventListener("click", () => { this.#acknowledged = this.#sticky; this.#lost(); });
   }
 
-  /** `nowMs` is the instrument's clock, since this computer's clock may differ. */
-  show(status, health, nowMs) {
+  /** `forS` is the time in this state, by no clock that can be set. */
+  show(status, health, forS) {
     delete document.body.dataset.stale;
     if (status.run_id && status.run_id !== this.#run) { this.#run = status.run_id; this.#acknowledged = this.#sticky = 0; }
     this.#sticky = Math.max(this.#sticky, health.lost_lines);
@@ -26,7 +26,7 @@ export class Band {
     document.body.dataset.state = status.state;
     $("state").textContent = WORDS[status.state];
     $("flag").textContent = unseen ? "lines lost" : document.body.dataset.level === "degraded" ? "degraded" : "";
-    $("since").textContent = status.busy ? `${status.busy} …` : `for ${duration(Math.max(0, nowMs - Date.parse(status.since)) / 1000)}`;
+    $("since").textContent = status.busy ? `${status.busy} …` : `for ${duration(forS)}`;
     $("sentence").textContent = unseen && !health.lost_lines ? `${count(this.#sticky)} lines were lost in the previous run.` : health.sentence;
     [$("left-label").textContent, $("left").textContent] = left(status);
     $("rig").textContent = status.name;
