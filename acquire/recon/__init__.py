@@ -13,7 +13,8 @@
     the default    choose                which prior predicts best; reuse: that of another part of the scene
                     ├─ workbench         trials of candidates: still, volume, cycle, brightness
                     └─ blinking          cosines: bandwidth, lamps, pursuit
-                        └─ patterns      with curves; evidence, settling; beside_motion, joined
+                        └─ patterns      with curves; evidence, settling, darkness; beside_motion,
+                                         joined
     iterations     admm                  sign, tv, volume, denoisers, kernels: its proximal steps
                     │
     judgement      estimates             what any solver returns

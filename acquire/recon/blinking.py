@@ -59,7 +59,7 @@ BEYOND_S = 2e-6
 """Time per line and frame of the search for light beyond the band, which is skipped if less is left."""
 WIDER_SHARE = 0.5
 """Share of the budget after which nothing is solved again in a wider band."""
-EXPLAINED_BY_NOISE, LEAST_MISSED = 1.25, 0.01
+EXPLAINED_BY_NOISE, LEAST_MISSED = 1.15, 0.01
 """Held-out error relative to the noise above which a lamp may hide that the band mimics, and the error itself
 if the noise is unknown; the search for it takes a tenth of the time."""
 SOON_EXPLAINED = 1.5
