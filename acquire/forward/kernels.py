@@ -136,33 +136,32 @@ def add_transposed_frames(video: NDArray[Any], out: NDArray[Any]) -> None:
                 out[t, c, r] += video[t, r, c]
 
 
-@numba.njit(cache=True)
-def gather_frame(
+@numba.njit(cache=True, fastmath={"contract", "nsz"})
+def move_frame(
     frame: NDArray[Any],
-    first: NDArray[np.uint32],
-    source: NDArray[np.uint32],
+    first: NDArray[np.uint64],
+    source: NDArray[np.uint64],
+    begins: NDArray[np.uint64],
     weight: NDArray[Any],
     out: NDArray[Any],
 ) -> None:
-    """out[p] = Σ_j weight[j]·frame[source[j]], j from first[p] to first[p + 1] - 1: a CSR matrix.
-
-    No fastmath: rows are so short that reordering their sums for wide instructions costs more than it saves.
-    """
-    for p in range(len(out)):
-        total = out.dtype.type(0)
-        for j in range(first[p], first[p + 1]):
-            total += weight[j] * frame[source[j]]
-        out[p] = total
+    """out[first[i] + j] += weight[begins[i] + j]·frame[source[i] + j] for all runs i: a sparse matrix."""
+    for i in range(np.uint64(len(first))):
+        # unsigned indices, since the compiler would test whether each of others counts from the end
+        to, at, begin = first[i], source[i], begins[i]
+        for j in range(begins[i + np.uint64(1)] - begin):
+            out[to + j] += weight[begin + j] * frame[at + j]
 
 
 @numba.njit(parallel=True, cache=True)
-def gather_frames(
+def move_frames(
     frames: NDArray[Any],
-    first: NDArray[np.uint32],
-    source: NDArray[np.uint32],
+    first: NDArray[np.uint64],
+    source: NDArray[np.uint64],
+    begins: NDArray[np.uint64],
     weight: NDArray[Any],
     out: NDArray[Any],
 ) -> None:
-    """Apply `gather_frame` to many frames in parallel."""
+    """Apply `move_frame` to many frames in parallel."""
     for k in numba.prange(out.shape[0]):
-        gather_frame(frames[k], first, source, weight, out[k])
+        move_frame(frames[k], first, source, begins, weight, out[k])
