@@ -165,3 +165,35 @@ def move_frames(
     """Apply `move_frame` to many frames in parallel."""
     for k in numba.prange(out.shape[0]):
         move_frame(frames[k], first, source, begins, weight, out[k])
+
+
+@numba.njit(parallel=True, cache=True, fastmath={"contract", "nsz"})
+def blur_frames(
+    frames: NDArray[Any],
+    along: NDArray[np.int64],
+    row_weights: NDArray[Any],
+    across: NDArray[np.int64],
+    column_weights: NDArray[Any],
+    out: NDArray[Any],
+) -> None:
+    """Add to out[k] what matrices on the rows and columns of frames[k] make of it, given as diagonals.
+
+    Diagonal ``along[i]`` has the weight row_weights[i, r] in row r, where it is inside the matrix.
+    """
+    n = frames.shape[1]
+    for k in numba.prange(frames.shape[0]):
+        line = np.empty(n, out.dtype)
+        for r in range(n):
+            line[:] = 0
+            for i in range(len(along)):
+                if 0 <= r + along[i] < n:
+                    weight, source = row_weights[i, r], frames[k, r + along[i]]
+                    for c in range(n):
+                        line[c] += weight * source[c]
+            for i in range(len(across)):
+                first, last = max(0, -across[i]), min(n, n - across[i])
+                length = last - first
+                to, at = out[k, r, first:last], line[first + across[i] : last + across[i]]
+                each = column_weights[i, first:last]
+                for c in range(length):
+                    to[c] += each[c] * at[c]
