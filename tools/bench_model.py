@@ -3,9 +3,11 @@
 Usage: OMP_NUM_THREADS=1 python -m tools.bench_model [--iterations 80]
 
 It uses 263 lines of the practice instrument in front of its lamps (voxels 3 x 1, 64 x 64 x 598), with a
-calibration of offsets, gains, balance, an excluded column, the cameras' curves and an alignment. All trials
-have the same bandwidth and number of iterations. Columns: processor seconds, which depend little on other
-load, and their ratio to a reconstruction without a calibration; the smaller of two runs.
+calibration of offsets, gains, balance, an excluded column, the cameras' curves, an alignment, and the optics'
+blur and veil. All trials have the same bandwidth and number of iterations. Columns: processor seconds, which
+depend little on other load, and their ratio to a reconstruction without a calibration; the smaller of two
+runs, in turns. Then an operator's forward and transpose alone, in milliseconds and with their ratio: medians
+of seven, in turns, for voxels 3 x 1 and 100 cosines, and for voxels 1 x 1 and 4 curves.
 """
 
 from __future__ import annotations
@@ -25,12 +27,16 @@ from acquire.calibrate.exposure import instrument_of
 from acquire.config import load_rig, load_scene
 from acquire.lines import Segment
 from acquire.recon import reconstruct
+from acquire.recon.band import segment_operator
+from acquire.recon.basis import TemporalBasis
 from acquire.simulate import simulate
 from acquire.store import open_recording
 from tools.results import Run, add_option, recorded
 
 LINES = 263
+OPERATORS, REPEATS = ((3, 100), (1, 4)), 7
 COLUMNS = ("offset_dn", "gain", "balance", "dn_per_electron", "read_noise_e")
+OPTICS = ("blur_px", "veil")
 
 
 def held(instrument_stages: int) -> dict[str, Measured]:
@@ -49,6 +55,8 @@ def held(instrument_stages: int) -> dict[str, Measured]:
         "dn_per_electron": Measured(np.full(2, 0.1), np.full(2, 1e-3)),
         "read_noise_e": Measured(np.full(2, 25.0), np.full(2, 0.1)),
         "excess_dn": Measured(np.stack([60 * x * (1 - x)] * 2), np.zeros((2, KNOTS))),
+        "blur_px": Measured(np.array([[0.6, 0.55], [0.7, 0.75]]), np.full((2, 2), 0.02)),
+        "veil": Measured(np.array([0.012, 0.011]), np.full(2, 1e-4)),
     }
 
 
@@ -66,7 +74,9 @@ def cases(directory: Path) -> dict[str, Segment]:
     curve = Calibration(instrument, {"excess_dn": quantities["excess_dn"]})
     columns = Calibration(instrument, {name: quantities[name] for name in COLUMNS}, usable)
     aligned = Calibration(instrument, alignment=found)
-    parts = {"curves": curve, "columns and balance": columns, "alignment": aligned, "everything": whole}
+    optics = Calibration(instrument, {name: quantities[name] for name in OPTICS})
+    parts = {"curves": curve, "columns and balance": columns, "alignment": aligned}
+    parts |= {"blur and veil": optics, "everything": whole}
     return {"nothing": segment} | {name: calibrated(segment, each) for name, each in parts.items()}
 
 
@@ -86,17 +96,45 @@ def measure(iterations: int, run: Run) -> None:
     frames = segments["nothing"].geometry.video_shape(3, 1)[0]
     chosen = reconstruct(segments["nothing"], 3, 1, iterations=20).parameters["temporal_coefficients"]
     bandwidth = int(chosen) / frames
-    bare = 0.0
-    for name, segment in segments.items():
+    for segment in segments.values():
         reconstruct(segment, 3, 1, iterations=1, bandwidth=bandwidth)  # compiles what it needs
-        times = []
-        for _ in range(2):
+    times: dict[str, list[float]] = {name: [] for name in segments}
+    for _ in range(2):
+        for name, segment in segments.items():
             began = time.process_time()
             reconstruct(segment, 3, 1, iterations=iterations, bandwidth=bandwidth)
-            times.append(time.process_time() - began)
-        bare = bare or min(times)
-        print(f"{name:20}  {min(times):6.2f} s  {min(times) / bare:5.2f}", flush=True)
-        run.add(name, cpu_s=min(times), ratio=min(times) / bare)
+            times[name].append(time.process_time() - began)
+    bare = min(times["nothing"])
+    for name, each in times.items():
+        print(f"{name:20}  {min(each):6.2f} s  {min(each) / bare:5.2f}", flush=True)
+        run.add(name, cpu_s=min(each), ratio=min(each) / bare)
+    for merge, count in OPERATORS:
+        operators(segments, merge, count, run)
+
+
+def operators(segments: dict[str, Segment], merge: int, count: int, run: Run) -> None:
+    """Time the operators of all cases alone."""
+    frames = segments["nothing"].geometry.video_shape(merge, 1)[0]
+    basis, rng = TemporalBasis(frames, count), np.random.default_rng(1)
+    made = {name: segment_operator(segment, basis, merge, 1) for name, segment in segments.items()}
+    theta = rng.standard_normal(made["nothing"].theta_shape).astype(np.float32)
+    lines = rng.standard_normal(segments["nothing"].lines.shape).astype(np.float32)
+    times: dict[str, list[float]] = {name: [] for name in made}
+    for _ in range(REPEATS):
+        for name, operator in made.items():
+            began = time.process_time()
+            for _ in range(10):
+                operator.forward(theta)
+                operator.adjoint(lines)
+            times[name].append((time.process_time() - began) / 10)
+    bare = float(np.median(times["nothing"]))
+    for name, each in times.items():
+        middle = float(np.median(each))
+        print(
+            f"operator {merge} x 1, {count:3}: {name:20}  {1e3 * middle:6.2f} ms  {middle / bare:5.2f}",
+            flush=True,
+        )
+        run.add(f"operator {merge} x 1, {count}: {name}", cpu_s=middle, ratio=middle / bare)
 
 
 if __name__ == "__main__":

@@ -10,19 +10,21 @@ taken; like the Gaussian, this is one matrix for rows and one for columns.
 The veil follows: v times the mean of the blurred frame, and 1 − v times the frame. Rows still sum to 1.
 
 If Λ′ is a product of dense factors (`acquire.recon.band`), these absorb the matrices once and nothing is done
-per frame. Otherwise frames are multiplied by them. Without a blur there are no matrices.
+per frame. Otherwise frames are multiplied by them, along their few diagonals that are not 0. Without a blur
+there are no matrices.
 """
 
 from __future__ import annotations
 
 from functools import lru_cache
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 from scipy.optimize import brentq
 
 from acquire.arrays import HOST
 from acquire.blur import falling
+from acquire.forward.kernels import blur_frames
 from acquire.forward.merge import block_bounds
 
 if TYPE_CHECKING:
@@ -36,6 +38,10 @@ CUT_AT = 4.0
 """Half-width of the kernel in σ, the default of `scipy.ndimage.gaussian_filter1d`."""
 NARROWEST = 0.2
 """σ of a kernel whose neighbours get 4·10⁻⁶; anything narrower is treated as a point."""
+NARROW = 0.2
+"""Diagonals of both axes, relative to the field's side, up to which loops are faster than dense products."""
+Band: TypeAlias = "tuple[NDArray[np.int64], NDArray[Any], NDArray[np.int64], NDArray[Any]]"
+"""Diagonals and weights of rows, and those of columns; see `band_of`."""
 
 
 def blurring(
@@ -49,29 +55,74 @@ class Blurring:
     """The blur of either arm on frames (k, n′, n′) in the scene's rows and columns, in any ``arrays``."""
 
     def __init__(self, blur: Blur, size: int, spatial_merge: int, arrays: Arrays = HOST) -> None:
-        self._pairs = [
-            tuple(arrays.asarray(each) for each in pair) for pair in blur_matrices(blur, size, spatial_merge)
-        ]
-        self._veil, self._xp = blur.veil, arrays.xp
-        self._mean = arrays.asarray(mean_weights(size, spatial_merge))
+        pairs = blur_matrices(blur, size, spatial_merge)
+        mean = mean_weights(size, spatial_merge)
+        self._pairs = [_Pair(*pair, arrays) for pair in pairs]
+        self._veil, self._xp, self._mean = blur.veil, arrays.xp, arrays.asarray(mean)
+        # what the veil's transpose multiplies by the sum of a frame
+        self._spread = [arrays.asarray(np.outer(mean @ rows, mean @ columns)) for rows, columns in pairs]
 
     def forward(self, arm: int, frames: Array) -> Array:
         """Blur and veil frames as arm 0 or 1 does."""
-        rows, columns = self._pairs[arm]
-        blurred, veil = rows @ frames @ columns.T, self._veil[arm]
+        blurred, veil = self._pairs[arm].forward(frames), self._veil[arm]
         if not veil:
             return blurred
         mean = (blurred @ self._mean) @ self._mean
-        return (1 - veil) * blurred + veil * mean[:, None, None]
+        blurred *= 1 - veil
+        blurred += veil * mean[:, None, None]
+        return blurred
 
     def adjoint(self, arm: int, frames: Array) -> Array:
         """Apply the transpose of `forward`."""
-        rows, columns = self._pairs[arm]
-        if veil := self._veil[arm]:
-            total = self._xp.sum(frames, axis=(1, 2))
-            weights = self._mean[:, None] * self._mean[None, :]
-            frames = (1 - veil) * frames + veil * total[:, None, None] * weights
-        return rows.T @ frames @ columns
+        back, veil = self._pairs[arm].adjoint(frames), self._veil[arm]
+        if not veil:
+            return back
+        total = veil * self._xp.sum(frames, axis=(1, 2))
+        back *= 1 - veil
+        back += total[:, None, None] * self._spread[arm]
+        return back
+
+
+class _Pair:
+    """A matrix on the rows of frames and one on their columns, as compiled loops along their diagonals.
+
+    They are bands, outside which all is 0. Wide ones, and those of other libraries, are multiplied as they
+    are.
+    """
+
+    def __init__(self, rows: NDArray[np.float64], columns: NDArray[np.float64], arrays: Arrays) -> None:
+        self._matrices = tuple(arrays.asarray(each) for each in (rows, columns))
+        self._bands: tuple[Band, Band] | None = None
+        if arrays.compiled:
+            both = (*band_of(rows, arrays.dtype), *band_of(columns, arrays.dtype))
+            back = (*band_of(rows.T, arrays.dtype), *band_of(columns.T, arrays.dtype))
+            if len(both[0]) + len(both[2]) <= NARROW * len(rows):
+                self._bands = both, back
+
+    def forward(self, frames: Array) -> Array:
+        rows, columns = self._matrices
+        return rows @ frames @ columns.T if self._bands is None else _narrow(frames, self._bands[0])
+
+    def adjoint(self, frames: Array) -> Array:
+        rows, columns = self._matrices
+        return rows.T @ frames @ columns if self._bands is None else _narrow(frames, self._bands[1])
+
+
+def _narrow(frames: NDArray[Any], band: Band) -> NDArray[Any]:
+    frames = np.ascontiguousarray(frames)
+    out = np.zeros_like(frames)
+    blur_frames(frames, *band, out)
+    return out
+
+
+def band_of(matrix: NDArray[np.float64], dtype: str) -> tuple[NDArray[np.int64], NDArray[Any]]:
+    """Return the diagonals that are not 0 as distances from the main one, and their weights by row."""
+    n = len(matrix)
+    row, column = np.nonzero(matrix)
+    distances = np.unique(column - row)
+    weights = np.zeros((len(distances), n), dtype)
+    weights[np.searchsorted(distances, column - row), row] = matrix[row, column]
+    return distances, weights
 
 
 def mean_weights(size: int, spatial_merge: int = 1) -> NDArray[np.float64]:

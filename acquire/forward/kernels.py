@@ -136,33 +136,64 @@ def add_transposed_frames(video: NDArray[Any], out: NDArray[Any]) -> None:
                 out[t, c, r] += video[t, r, c]
 
 
-@numba.njit(cache=True)
-def gather_frame(
+@numba.njit(cache=True, fastmath={"contract", "nsz"})
+def move_frame(
     frame: NDArray[Any],
-    first: NDArray[np.uint32],
-    source: NDArray[np.uint32],
+    first: NDArray[np.uint64],
+    source: NDArray[np.uint64],
+    begins: NDArray[np.uint64],
     weight: NDArray[Any],
     out: NDArray[Any],
 ) -> None:
-    """out[p] = Σ_j weight[j]·frame[source[j]], j from first[p] to first[p + 1] - 1: a CSR matrix.
-
-    No fastmath: rows are so short that reordering their sums for wide instructions costs more than it saves.
-    """
-    for p in range(len(out)):
-        total = out.dtype.type(0)
-        for j in range(first[p], first[p + 1]):
-            total += weight[j] * frame[source[j]]
-        out[p] = total
+    """out[first[i] + j] += weight[begins[i] + j]·frame[source[i] + j] for all runs i: a sparse matrix."""
+    for i in range(np.uint64(len(first))):
+        # unsigned indices, since the compiler would test whether each of others counts from the end
+        to, at, begin = first[i], source[i], begins[i]
+        for j in range(begins[i + np.uint64(1)] - begin):
+            out[to + j] += weight[begin + j] * frame[at + j]
 
 
 @numba.njit(parallel=True, cache=True)
-def gather_frames(
+def move_frames(
     frames: NDArray[Any],
-    first: NDArray[np.uint32],
-    source: NDArray[np.uint32],
+    first: NDArray[np.uint64],
+    source: NDArray[np.uint64],
+    begins: NDArray[np.uint64],
     weight: NDArray[Any],
     out: NDArray[Any],
 ) -> None:
-    """Apply `gather_frame` to many frames in parallel."""
+    """Apply `move_frame` to many frames in parallel."""
     for k in numba.prange(out.shape[0]):
-        gather_frame(frames[k], first, source, weight, out[k])
+        move_frame(frames[k], first, source, begins, weight, out[k])
+
+
+@numba.njit(parallel=True, cache=True, fastmath={"contract", "nsz"})
+def blur_frames(
+    frames: NDArray[Any],
+    along: NDArray[np.int64],
+    row_weights: NDArray[Any],
+    across: NDArray[np.int64],
+    column_weights: NDArray[Any],
+    out: NDArray[Any],
+) -> None:
+    """Add to out[k] what matrices on the rows and columns of frames[k] make of it, given as diagonals.
+
+    Diagonal ``along[i]`` has the weight row_weights[i, r] in row r, where it is inside the matrix.
+    """
+    n = frames.shape[1]
+    for k in numba.prange(frames.shape[0]):
+        line = np.empty(n, out.dtype)
+        for r in range(n):
+            line[:] = 0
+            for i in range(len(along)):
+                if 0 <= r + along[i] < n:
+                    weight, source = row_weights[i, r], frames[k, r + along[i]]
+                    for c in range(n):
+                        line[c] += weight * source[c]
+            for i in range(len(across)):
+                first, last = max(0, -across[i]), min(n, n - across[i])
+                length = last - first
+                to, at = out[k, r, first:last], line[first + across[i] : last + across[i]]
+                each = column_weights[i, first:last]
+                for c in range(length):
+                    to[c] += each[c] * at[c]

@@ -12,23 +12,31 @@ more sub-steps cost nothing. Without an alignment there is no R.
 from __future__ import annotations
 
 from functools import lru_cache
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 from scipy import sparse
 
 from acquire.arrays import HOST
-from acquire.forward.kernels import gather_frame, gather_frames
+from acquire.forward.kernels import move_frame, move_frames
 from acquire.forward.merge import block_bounds
 
 if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
     from acquire.alignment import Alignment
     from acquire.arrays import Array, Arrays
     from acquire.geometry import Geometry
 
 
-FEW = 2**21
+FEW = 2**23
 """Products that one thread computes before others could be woken on a busy host."""
+PART = 2048
+"""Pixels that are handled together: in float64 they and their sources fill the nearest cache."""
+GAP = 32
+"""Elements of a run that take as long as a further run."""
+Runs: TypeAlias = "tuple[NDArray[np.uint64], NDArray[np.uint64], NDArray[np.uint64], NDArray[Any]]"
+"""First row, first column and first weight of each run, and all weights; see `runs`."""
 
 
 def registration(
@@ -42,8 +50,14 @@ class Registration:
     """R on frames (k, n′, n′), in any ``arrays``."""
 
     def __init__(self, alignment: Alignment, size: int, spatial_merge: int, arrays: Arrays = HOST) -> None:
-        pair = _with_transpose(alignment, size, spatial_merge)
-        self._forward, self._adjoint = (_Gather(each, arrays) for each in pair)
+        self._forward: _Moved | _Gathered
+        self._adjoint: _Moved | _Gathered
+        if arrays.compiled:
+            pair = _runs_both_ways(alignment, size, spatial_merge, arrays.dtype)
+            self._forward, self._adjoint = (_Moved(each) for each in pair)
+        else:
+            both = _with_transpose(alignment, size, spatial_merge)
+            self._forward, self._adjoint = (_Gathered(each, arrays) for each in both)
 
     def forward(self, frames: Array) -> Array:
         """Map arm A's view (k, n′, n′) to arm B's."""
@@ -61,6 +75,13 @@ def _with_transpose(
     """Return R and Rᵀ; cached, since a refinement needs them round after round."""
     matrix = sampling_matrix(alignment, size, spatial_merge)
     return matrix, matrix.T.tocsr()
+
+
+@lru_cache(maxsize=8)
+def _runs_both_ways(alignment: Alignment, size: int, spatial_merge: int, dtype: str) -> tuple[Runs, Runs]:
+    """Return the runs of R and Rᵀ; cached like these."""
+    matrix, transpose = _with_transpose(alignment, size, spatial_merge)
+    return runs(matrix, dtype), runs(transpose, dtype)
 
 
 def sampling_matrix(alignment: Alignment, size: int, spatial_merge: int = 1) -> sparse.csr_array:
@@ -105,17 +126,29 @@ def interpolation_variance(alignment: Alignment, size: int) -> tuple[float, floa
     return rows, columns
 
 
-class _Gather:
-    """A sparse matrix that acts on the pixels of frames."""
+class _Moved:
+    """A sparse matrix that acts on the pixels of frames, by compiled loops along its `runs`."""
+
+    def __init__(self, given: Runs) -> None:
+        self._runs = given
+
+    def __call__(self, frames: NDArray[Any]) -> NDArray[Any]:
+        out = np.zeros(frames.shape, frames.dtype)
+        flat, flat_out = frames.reshape(len(frames), -1), out.reshape(len(frames), -1)
+        if len(flat) * len(self._runs[-1]) > FEW:
+            move_frames(flat, *self._runs, flat_out)
+            return out
+        for frame, row in zip(flat, flat_out, strict=True):
+            move_frame(frame, *self._runs, row)
+        return out
+
+
+class _Gathered:
+    """The same in operations that every array library has: term j holds the j-th element of every row."""
 
     def __init__(self, matrix: sparse.csr_array, arrays: Arrays) -> None:
-        self._arrays = arrays
+        self._xp = arrays.xp
         self._terms: list[tuple[Array, Array]] = []
-        if arrays.compiled:
-            self._first = matrix.indptr.astype(np.uint32)
-            self._source, self._weight = matrix.indices.astype(np.uint32), matrix.data.astype(arrays.dtype)
-            return
-        # term j holds the j-th element of every row
         counts = np.diff(matrix.indptr)
         for j in range(int(counts.max())):
             # rows with fewer elements read those of the next row, with weight 0
@@ -125,19 +158,33 @@ class _Gather:
             self._terms.append((arrays.indices(index), arrays.asarray(weight)))
 
     def __call__(self, frames: Array) -> Array:
-        if not self._terms:
-            out = np.empty(frames.shape, frames.dtype)
-            flat, flat_out = frames.reshape(len(frames), -1), out.reshape(len(frames), -1)
-            if flat.shape[0] * len(self._source) > FEW:
-                gather_frames(flat, self._first, self._source, self._weight, flat_out)
-                return out
-            for frame, row in zip(flat, flat_out, strict=True):
-                gather_frame(frame, self._first, self._source, self._weight, row)
-            return out
-        xp = self._arrays.xp
-        flat = xp.reshape(frames, (frames.shape[0], -1))
-        parts = (weight * xp.take(flat, index, axis=1) for index, weight in self._terms)
+        flat = self._xp.reshape(frames, (frames.shape[0], -1))
+        parts = (weight * self._xp.take(flat, index, axis=1) for index, weight in self._terms)
         total = next(parts)
         for part in parts:
             total += part
-        return xp.reshape(total, frames.shape)
+        return self._xp.reshape(total, frames.shape)
+
+
+def runs(matrix: sparse.csr_array, dtype: str) -> Runs:
+    """Return a matrix as runs along its diagonals: first row, first column, first weight of each; weights.
+
+    Neighbouring pixels of arm B look at neighbouring points of arm A's view, so that R is a few diagonals in
+    long runs. A run multiplies consecutive pixels, which wide instructions do at once. The weights of run i
+    are those from ``begins[i]`` to ``begins[i + 1]``, some of them 0, since short gaps are filled. Runs that
+    end in the same part of the frame follow one another, so that it stays in the nearest cache.
+    """
+    elements = matrix.tocoo()
+    row, column = elements.row.astype(np.int64), elements.col.astype(np.int64)
+    part, diagonal = row // PART, column - row
+    order = np.lexsort((row, diagonal, part))
+    row, column, part, diagonal = row[order], column[order], part[order], diagonal[order]
+    apart = (np.diff(part) != 0) | (np.diff(diagonal) != 0) | (np.diff(row) > GAP)
+    starts = np.concatenate([[0], np.flatnonzero(apart) + 1])
+    ends = np.append(starts[1:], len(row)) - 1
+    begins = np.concatenate([[0], np.cumsum(row[ends] - row[starts] + 1)])
+    run = np.repeat(np.arange(len(starts)), ends - starts + 1)
+    weights = np.zeros(begins[-1], dtype)
+    weights[begins[run] + row - row[starts][run]] = elements.data[order]
+    first, source, begins = (each.astype(np.uint64) for each in (row[starts], column[starts], begins))
+    return first, source, begins, weights

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from array_api_compat import is_numpy_array
 
-from acquire.arrays import host
+from acquire.arrays import host, namespace
 from acquire.cores import granted_threads, side_by_side
 from acquire.forward import (
     DualArm,
@@ -29,6 +29,7 @@ from acquire.forward import (
     mean_weights,
     registration,
 )
+from acquire.recon.kernels import add_outer
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -199,7 +200,7 @@ class BandOperator:
         side, pixels = merging.shape
         blocks = self._xp.reshape(view, (-1, side))
         lines = factor @ (blocks @ merging) if side > pixels else (factor @ blocks) @ merging
-        return lines if (veil := self._veils[arm]) is None else lines + veil.forward(view)
+        return lines if (veil := self._veils[arm]) is None else lines + veil.forward(blocks)
 
     def _arm_adjoint(self, arm: int, lines: Array) -> Array:
         """The transpose of `_arm`: (n′·K, n′)."""
@@ -208,7 +209,7 @@ class BandOperator:
         back = (factor.T @ lines) @ merging.T if side > pixels else factor.T @ (lines @ merging.T)
         if (veil := self._veils[arm]) is None:
             return back
-        return back + self._xp.reshape(veil.adjoint(lines), back.shape)
+        return veil.add_adjoint(lines, back)
 
 
 @dataclass(frozen=True, slots=True)
@@ -227,15 +228,22 @@ class Veil:
     factor: Array
     pixels: Array
 
-    def forward(self, view: Array) -> Array:
-        """(block, K, across) → (L_R, M)."""
-        means = self.along @ (view @ self.across)
+    def forward(self, blocks: Array) -> Array:
+        """(n′·K, across) → (L_R, M)."""
+        xp, side = namespace(blocks), self.along.shape[0]
+        # along the charge first: one product with a vector, of everything in the order of memory
+        sums = self.along @ xp.reshape(blocks, (side, -1))
+        means = xp.reshape(sums, (-1, self.across.shape[0])) @ self.across
         return (self.factor @ means)[:, None] * self.pixels
 
-    def adjoint(self, lines: Array) -> Array:
-        """(L_R, M) → (block, K, across)."""
-        means = self.factor.T @ (lines @ self.pixels)
-        return self.along[:, None, None] * means[:, None] * self.across
+    def add_adjoint(self, lines: Array, back: Array) -> Array:
+        """Add the transpose, (L_R, M) → (n′·K, across), to ``back``, which may be overwritten."""
+        xp, means = namespace(lines), self.factor.T @ (lines @ self.pixels)
+        levels = xp.reshape(self.along[:, None] * means, (-1,))
+        if is_numpy_array(back):
+            add_outer(levels, self.across, back)
+            return back
+        return back + levels[:, None] * self.across
 
 
 class InBasis:

@@ -10,7 +10,8 @@ versions are several times slower (tools/bench_tv.py).
 Frames k with edges in common have the prox of Σ √(Σ_k λ_k²·|∇x_k|²) (vectorial total variation, Bresson and
 Chan, Inverse Probl. Imaging 2, 455 (2008)): x_k = b_k + λ_k·div(p_k, q_k), Σ_k |(p_k, q_k)|² ≤ 1.
 
-Also those of the prox in three dimensions (`volume`) and of the split of the sign (`sign`).
+Also those of the prox in three dimensions (`volume`), of the split of the sign (`sign`) and of a veil
+(`band`).
 """
 
 from __future__ import annotations
@@ -358,3 +359,12 @@ def sign_pull(signed: NDArray[Any], scale: float, grid: NDArray[Any], out: NDArr
                     weight, total = grid[k, t], out[k, r]
                     for c in range(columns):
                         total[c] += weight * reflected[c]
+
+
+@numba.njit(cache=True, fastmath=_FAST)
+def add_outer(column: NDArray[Any], row: NDArray[Any], out: NDArray[Any]) -> None:
+    """out[i, j] += column[i]·row[j]."""
+    for i in range(out.shape[0]):
+        value = column[i]
+        for j in range(out.shape[1]):
+            out[i, j] += value * row[j]

@@ -25,6 +25,7 @@ from acquire.config.rig import ConstantCodeConfig
 from acquire.config.scene import SceneFile
 from acquire.errors import UsageError
 from acquire.fibre import Tile
+from acquire.lines import merged
 from acquire.recon import reconstruct
 from acquire.sim.leds import LedSceneConfig
 from acquire.simulate import simulate
@@ -42,6 +43,7 @@ UNEVEN = [
     {"kind": "prnu", "prnu": 0.03},
     {"kind": "dsnu", "dsnu_e": 60.0},
 ]
+DISPLACED = {"kind": "fibre_bands", "shift_pixels": 1.0}
 LED = {"name": "x", "row": 0.5, "column": 0.5, "drive": {"waveform": "constant", "level": 1.0}}
 
 
@@ -120,17 +122,45 @@ def test_explain_names_the_tile_it_measured(
     assert by_part["gains per column"]["gain_db"] > 0.3
 
 
+def of_dots(home: Path, effects: list[dict[str, Any]], steady: int | None = None) -> Exposure:
+    """Dots behind a fibre in 2 × 3 tiles of 32 columns; ``steady``: white in constant light instead."""
+    changes = {**SETTINGS, "geometry.stages": 32, "fibre.rows": 64, "fibre.columns": 96}
+    rig = load_rig("rig-demo", {**changes, "fibre.sensor_pixels": 200})
+    if steady is not None:
+        rig = rig.model_copy(update={"code": ConstantCodeConfig(kind="constant", value=steady)})
+    dots = np.random.default_rng(3).random((32, 32)).repeat(3, axis=0).repeat(3, axis=1) > 0.6
+    picture = 200 * dots if steady is None else np.full_like(dots, 100, np.int64)
+    Image.fromarray(picture.astype(np.uint8)).save(home / "scene.png")
+    table = {"kind": "video", "path": str(home / "scene.png"), "effects": effects}
+    path = home / f"dots-{steady}.zarr"
+    simulate(rig, SceneFile.model_validate(table).root, path, 600)
+    return open_exposure(path, 64, 500)
+
+
 @pytest.fixture
 def displaced(tmp_path: Path) -> Exposure:
     """Clean dots behind a fibre whose bands are displaced, in 2 × 3 tiles."""
-    changes = {**SETTINGS, "geometry.stages": 32, "fibre.rows": 64, "fibre.columns": 96}
-    rig = load_rig("rig-demo", {**changes, "fibre.sensor_pixels": 200})
-    dots = np.random.default_rng(3).random((32, 32)).repeat(3, axis=0).repeat(3, axis=1) > 0.6
-    Image.fromarray((200 * dots).astype(np.uint8)).save(tmp_path / "dots.png")
-    table = {"kind": "video", "path": str(tmp_path / "dots.png")}
-    table |= {"effects": [{"kind": "fibre_bands", "shift_pixels": 1.0}]}
-    simulate(rig, SceneFile.model_validate(table).root, tmp_path / "dots.zarr", 600)
-    return open_exposure(tmp_path / "dots.zarr", 64, 500)
+    return of_dots(tmp_path, [DISPLACED])
+
+
+def test_gains_and_displacement_of_a_tile_are_corrected_in_merged_lines_too(tmp_path: Path) -> None:
+    """Dark, flat and target of an uneven, noisy instrument; raw lines in larger voxels, merged lines."""
+    effects = [DISPLACED, *UNEVEN, {"kind": "shot_noise"}, {"kind": "read_noise", "sigma_e": 10.0}]
+    first = of_dots(tmp_path, effects, 0)
+    known = Calibration(first.instrument).with_step(dark(first))
+    known = known.with_step(flat(of_dots(tmp_path, effects, 1), known))
+    target = of_dots(tmp_path, effects)
+    known = known.with_step(tile_alignments(target, known))
+    lines = target.recording.cut(64, 150, Tile(1, 2))
+    corrected = calibrated(lines, known)
+    assert corrected.alignment is not None
+    stages = {"nothing": lines, "columns": replace(corrected, alignment=None), "all": corrected}
+    for count, voxel in ((1, 2), (2, 1)):
+        missed = {
+            name: reconstruct(merged(each, count), voxel, 181, "fast", check=False).quality.prediction
+            for name, each in stages.items()
+        }
+        assert missed["all"] < 0.8 * missed["columns"] < 0.8 * missed["nothing"], (count, voxel, missed)
 
 
 def test_displaced_bands_are_measured_tile_by_tile_and_corrected(displaced: Exposure) -> None:

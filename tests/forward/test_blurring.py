@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from scipy.ndimage import gaussian_filter1d
 
 from acquire.alignment import Alignment
-from acquire.arrays import Arrays
+from acquire.arrays import Arrays, Dtype
 from acquire.blur import Blur
 from acquire.errors import UsageError
 from acquire.forward import (
@@ -23,7 +23,7 @@ from acquire.forward import (
     mean_weights,
     merge_video,
 )
-from acquire.forward.blurring import blur_matrix, kernel
+from acquire.forward.blurring import Blurring, blur_matrix, kernel
 from acquire.forward.registration import sampling_matrix
 from acquire.geometry import Geometry
 
@@ -191,3 +191,27 @@ def test_impossible_veils_are_refused(veil: float) -> None:
 
 def test_the_arms_exchange_their_veils() -> None:
     assert Blur((0, 0), (0, 0), veil=(0.01, 0.03)).swapped().veil == (0.03, 0.01)
+
+
+@pytest.mark.parametrize("merge", [1, 3])
+@pytest.mark.parametrize("dtype", ["float32", "float64"])
+def test_frames_are_blurred_along_diagonals_as_by_the_matrices(merge: int, dtype: Dtype) -> None:
+    """Narrow bands by compiled loops, wide ones by products, with a lens and a veil."""
+    size, side = 96, 96 // merge
+    mean = mean_weights(size, merge)
+    rng = np.random.default_rng(8)
+    frames = rng.standard_normal((3, side, side)).astype(dtype)
+    for sigma in (0.6, 15.0):
+        blur = Blur((sigma, 0.4), (0.9, sigma), (0.1, -0.2, 0.0, -0.15), veil=(0.03, 0.0))
+        model = Blurring(blur, size, merge, Arrays(dtype=dtype))
+        for arm, (rows, columns) in enumerate(blur_matrices(blur, size, merge)):
+            image = rows @ frames @ columns.T
+            veil = blur.veil[arm]
+            expected = (1 - veil) * image + veil * (image @ mean @ mean)[:, None, None]
+            found, given = model.forward(arm, frames), rng.standard_normal(frames.shape).astype(dtype)
+            assert found.dtype == dtype
+            tolerance = 1e-5 if dtype == "float32" else 1e-12
+            np.testing.assert_allclose(found, expected, atol=tolerance)
+            back = model.adjoint(arm, given)
+            scale = np.linalg.norm(found) * np.linalg.norm(given)
+            assert abs(np.vdot(found, given) - np.vdot(frames, back)) < tolerance * scale

@@ -11,9 +11,10 @@ from hypothesis import strategies as st
 from scipy.ndimage import affine_transform
 
 from acquire.alignment import Alignment
+from acquire.arrays import Arrays, Dtype
 from acquire.errors import UsageError
 from acquire.forward import DualArm, Registration, hold_video, merge_video
-from acquire.forward.registration import sampling_matrix
+from acquire.forward.registration import FEW, runs, sampling_matrix
 from acquire.geometry import Geometry
 from acquire.sim.effects.lens import LensDistortion
 
@@ -130,3 +131,25 @@ def test_only_arm_b_is_displaced_and_the_transpose_is_exact(
 def test_impossible_alignments_are_refused(values: tuple[float, float, float, float]) -> None:
     with pytest.raises(UsageError, match="alignment"):
         Alignment(*values)
+
+
+@pytest.mark.parametrize(
+    ("merge", "alignment"), [(1, Alignment(6.0, -4.0, 0.5)), (3, Alignment(1.4, 2.3, -12.0))]
+)
+@pytest.mark.parametrize("dtype", ["float32", "float64"])
+def test_frames_are_moved_along_diagonals_as_by_the_matrix(
+    merge: int, alignment: Alignment, dtype: Dtype
+) -> None:
+    """In parts of a frame, with runs that are interrupted at its edges, for few frames and for many."""
+    size, side = 96, 96 // merge
+    matrix = sampling_matrix(alignment, size, merge)
+    moved = Registration(alignment, size, merge, Arrays(dtype=dtype))
+    assert len(runs(matrix, dtype)[0]) > 8
+    rng = np.random.default_rng(7)
+    for count in (1, FEW // matrix.nnz + 1):
+        frames = rng.standard_normal((count, side, side)).astype(dtype)
+        for product, which in ((moved.forward, matrix), (moved.adjoint, matrix.T)):
+            expected = (which @ frames.reshape(count, -1).T).T.reshape(frames.shape)
+            found = product(frames)
+            assert found.dtype == dtype
+            np.testing.assert_allclose(found, expected, atol=1e-5 if dtype == "float32" else 1e-12)
