@@ -1,4 +1,4 @@
-"""Escaping of foreign text for a terminal, a log or the wire.
+"""Foreign text for a terminal, a log or the wire: escaped, shortened, and exceptions in words.
 
 Foreign is whatever this program did not write: an operator's mark, the attributes of a recording, file
 names, answers of a device or a remote store. A newline in it forges a line of the log, an escape sequence
@@ -9,6 +9,7 @@ not UTF-8 cannot be encoded at all.
 from __future__ import annotations
 
 import difflib
+import os
 import re
 import reprlib
 from typing import TYPE_CHECKING
@@ -48,6 +49,17 @@ def did_you_mean(word: str, possible: Iterable[str]) -> str:
     """Return ``; did you mean 'start'?`` for a word close to a possible one, else an empty text."""
     near = difflib.get_close_matches(word, list(possible), n=1)
     return f"; did you mean {near[0]!r}?" if near else ""
+
+
+def cause_in_words(error: BaseException) -> str:
+    """Return what an exception of Python or of a library says, as a clause that a reader understands."""
+    if isinstance(error, KeyError) and error.args:
+        return f"{error.args[0]!r} is missing"  # its text is the key alone
+    if isinstance(error, FileNotFoundError) and error.filename:
+        return f"{os.path.basename(error.filename)} is missing"  # noqa: PTH119 (it may be a URL)
+    if isinstance(error, OSError) and error.strerror:
+        return error.strerror
+    return str(error) or type(error).__name__
 
 
 def own_words(message: str) -> str:

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from acquire.text import shortened, visible
+from acquire.text import cause_in_words, shortened, visible
 
 
 @pytest.mark.parametrize(
@@ -38,3 +38,17 @@ def test_whatever_it_is_can_be_encoded_and_is_one_line(text: str) -> None:
 def test_a_cut_is_marked() -> None:
     assert shortened("x" * 500, 10) == "x" * 9 + "…"
     assert shortened("x" * 10, 10) == "x" * 10
+
+
+@pytest.mark.parametrize(
+    ("error", "words"),
+    [
+        (KeyError("shape"), "'shape' is missing"),
+        (FileNotFoundError(2, "No such file or directory", "/data/r.zarr/events/text/c"), "c is missing"),
+        (PermissionError(13, "Permission denied"), "Permission denied"),
+        (ValueError("3 is not a name"), "3 is not a name"),
+        (ArithmeticError(), "ArithmeticError"),
+    ],
+)
+def test_exceptions_are_said_without_the_names_of_classes(error: Exception, words: str) -> None:
+    assert cause_in_words(error) == words

@@ -33,6 +33,7 @@ from acquire.alignment import Alignment
 from acquire.errors import DataError, UsageError
 from acquire.lines import ARMS
 from acquire.showing import in_words
+from acquire.text import cause_in_words
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -347,7 +348,7 @@ class Calibration:
                 ),
             )
         except (LookupError, TypeError, ValueError, AttributeError, ValidationError, UsageError) as error:
-            why = error.message if isinstance(error, UsageError) else error
+            why = error.message if isinstance(error, UsageError) else cause_in_words(error)
             raise DataError(f"the calibration is damaged: {why}", hint="measure it again") from error
 
 

@@ -323,6 +323,7 @@ def _summary(path: Path) -> dict[str, Any] | None:
     """
     from acquire.store import open_outline
     from acquire.store.layout import DAMAGE
+    from acquire.text import cause_in_words
 
     try:
         # A recording on a disk that is not mounted must not be left out without a word.
@@ -338,7 +339,7 @@ def _summary(path: Path) -> dict[str, Any] | None:
     except AcquireError as error:
         return {"path": str(path), "error": error.message}
     except (*DAMAGE, MemoryError) as error:  # one damaged recording must not keep the others off the list
-        return {"path": str(path), "error": f"{path} cannot be read: {error}"}
+        return {"path": str(path), "error": f"{path} cannot be read: {cause_in_words(error)}"}
     keys = ("path", "run_id", "state", "written", "run_condition", "lines")
     return {key: facts[key] for key in (*keys, "duration_s", "bytes", "start_ns", "damage")}
 

@@ -23,6 +23,7 @@ from acquire.recon.bandwidth import FASTEST_SHARE, FEWEST_COEFFICIENTS, MARGIN
 from acquire.recon.basis import LearnedBasis, TemporalBasis, reachable, resized
 from acquire.recon.cosines import begin_in_cosines
 from acquire.recon.patterns import has_clear_patterns
+from acquire.recon.settling import BEYOND_CHANCE
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -48,8 +49,11 @@ DARK, LAMP = 2.0, 8.0
 after a round, and above which it is a lamp's in the end. Lamps reach 2.5 (M = 256) to 30 in a round and
 hundreds later; sidelobes of the code mostly less than 2, and at most 27."""
 FAINT = 0.02
-"""Energy of a lamp, relative to the brightest one's, below which it may be a sidelobe (up to 0.013): it does
-not widen the band, but may still be found in the residual of the patterns."""
+"""Energy of a lamp, relative to the brightest one's, below which it may be a sidelobe (up to 0.013, rarely
+0.03): it does not widen the band, but may still be found in the residual of the patterns."""
+DOUBTFUL = 0.1
+"""The same below which the held-out samples have to be predicted worse without it: above, it is a
+lamp."""
 
 
 def pursue(
@@ -95,6 +99,8 @@ def pursue(
             return None
         lamps = np.concatenate([lamps, found])
         look = look.moved(_windows(np.concatenate([lamps, NO_COSINES if told is None else told]), fastest))
+    if told is not None and len(sure):
+        sure = look.needed(sure)
     if told is None or not len(sure):
         return None
     # What is slower than a lamp costs little.
@@ -145,6 +151,27 @@ class _Look:
         near = [energy[np.abs(self.kept - lamp) <= BESIDE].max() for lamp in lamps]
         relative: NDArray[np.float64] = np.array(near) / max(usual, np.finfo(np.float64).tiny)
         return relative
+
+    def needed(self, lamps: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Those of the lamps without which the held-out samples are predicted worse.
+
+        Bright ones are, and without held-out samples all. Light that only a sidelobe of the code has brought
+        to a cosine explains the used samples, and no others.
+        """
+        light, problem = self.light(lamps), self.given.problem
+        limit = 1 + BEYOND_CHANCE / np.sqrt(2 * max(1, problem.held_out.sum()))
+        error = problem.prediction_error(self.estimate.predict())
+
+        def superfluous(lamp: np.int64) -> bool:
+            others = (self.kept < FEWEST_COEFFICIENTS) | (np.abs(self.kept - lamp) > BESIDE)
+            without = self.moved(self.kept[others]).estimate.predict()
+            return bool(problem.prediction_error(without) <= limit * error)
+
+        kept = [
+            energy >= DOUBTFUL * light.max() or not superfluous(lamp)
+            for lamp, energy in zip(lamps, light, strict=True)
+        ]
+        return lamps[kept]
 
 
 def _beyond(last: int, known: int, fastest: int) -> NDArray[np.int64]:

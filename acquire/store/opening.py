@@ -15,6 +15,7 @@ from acquire.store.extent import check_lengths
 from acquire.store.layout import DAMAGE, READABLE
 from acquire.store.refusals import refusal, refused
 from acquire.store.source import source_of
+from acquire.text import cause_in_words
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -63,7 +64,7 @@ def opened(source: Source, kind: type[Kind], document: Document | None = None) -
         check_lengths(found)
     except (*DAMAGE, UsageError) as error:
         raise DataError(
-            f"{source}: the metadata of the recording is damaged: {type(error).__name__}: {error}",
+            f"{source}: the metadata of the recording is damaged: {cause_in_words(error)}",
             hint="a copy of the recording",
         ) from error
     return found

@@ -22,6 +22,7 @@ from acquire.store import layout, overview
 from acquire.store.files import SCRATCH, Publisher
 from acquire.store.removal import COPY, ROOT
 from acquire.store.table import event_table, gap_table
+from acquire.text import cause_in_words
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -118,7 +119,7 @@ def _arms(path: Path, attributes: dict[str, Any]) -> dict[str, layout.Document]:
         group = {"first_line": int(attributes["first_line"])}
     except layout.PARSE_ERRORS as error:
         raise DataError(
-            f"{path}: its root zarr.json is lost, and its arrays are damaged: {error!r}"
+            f"{path}: its root zarr.json is lost, and its arrays are damaged: {cause_in_words(error)}"
         ) from error
     ordered: dict[str, layout.Document] = {}  # zarr relies on a group being followed by its members
     for arm in ARMS:

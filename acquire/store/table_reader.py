@@ -10,6 +10,7 @@ from acquire.errors import DataError
 from acquire.store.layout import PARSE_ERRORS
 from acquire.store.refusals import refusal, shows_damage
 from acquire.store.shape import CRC_BYTES, small_crc32c
+from acquire.text import cause_in_words
 
 if TYPE_CHECKING:
     from acquire.store.layout import Document
@@ -88,7 +89,10 @@ class _Table:
             raise self._damaged(column, error) from error
 
     def _damaged(self, column: str, error: Exception) -> DataError:
-        return DataError(f"{self.source}: table {self.name}/{column} cannot be read: {error!r}")
+        return DataError(
+            f"{self.source}: table {self.name}/{column} cannot be read: {cause_in_words(error)}",
+            hint="acquire verify, which names all that is damaged",
+        )
 
     def numbers(self, column: str) -> list[int]:
         return self.cells(column)

@@ -34,7 +34,7 @@ from acquire.store.refusals import refused
 from acquire.store.source import source_of
 from acquire.store.video_layout import FORMAT, VideoGrid
 from acquire.store.video_writer import VideoWriter, check_provenance
-from acquire.text import shortened
+from acquire.text import cause_in_words, shortened
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -216,7 +216,7 @@ def open_video(place: Path | str) -> VideoFile:
     except (GroupNotFoundError, NotADirectoryError) as error:
         raise PlaceError(f"{source} is not a video: it is not a Zarr group", hint=_VIDEO) from error
     except DAMAGE as error:
-        raise DataError(f"{source} is not a video, or is damaged: {error}") from error
+        raise DataError(f"{source} is not a video, or is damaged: {cause_in_words(error)}") from error
     return found
 
 

@@ -32,7 +32,7 @@ from acquire.store.opening import read_root, stated_format
 from acquire.store.refusals import refused
 from acquire.store.shortfall import first_shortfall, missing_segments
 from acquire.store.source import source_of
-from acquire.text import shortened
+from acquire.text import cause_in_words, shortened
 from acquire.web.messages import (
     EventFacts,
     GapFacts,
@@ -222,7 +222,9 @@ class Archive:
         except AcquireError as error:
             return RecordingFacts(name=path.name, error=shortened(error.message, 300))
         except (*DAMAGE, MemoryError) as error:
-            return RecordingFacts(name=path.name, error=f"cannot be read: {shortened(error, 300)}")
+            return RecordingFacts(
+                name=path.name, error=f"cannot be read: {shortened(cause_in_words(error), 300)}"
+            )
         # A recording that is being written changes more often than its root document does.
         if known.state == "sealed" and entry.stamp is not None:
             self._facts[path.name] = entry.stamp, known

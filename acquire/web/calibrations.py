@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 from acquire.calibrate.guide import STEPS, Step
 from acquire.errors import AcquireError, DataError, NoDaemonError, PlaceError, UsageError
-from acquire.text import shortened
+from acquire.text import cause_in_words, shortened
 from acquire.web.messages import CalibrationFacts, CalibrationRequest, FindingFacts, StepFacts
 
 if TYPE_CHECKING:
@@ -97,4 +97,6 @@ def _finding(known: Calibration, name: str) -> FindingFacts:
             warnings=list(finding.warnings),
         )
     except (LookupError, TypeError, ValueError) as error:
-        raise DataError(f"the step {name!r} of the calibration cannot be read: {error!r}") from error
+        raise DataError(
+            f"the step {name!r} of the calibration cannot be read: {cause_in_words(error)}"
+        ) from error

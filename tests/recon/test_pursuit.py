@@ -90,6 +90,27 @@ def test_another_cosine_leaves_the_picture_as_it_is() -> None:
     np.testing.assert_allclose(host(beyond.solver.theta)[:40], host(whole.solver.theta))
 
 
+def test_only_lamps_that_the_held_out_samples_need_are_sure(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Fig. 9 with code 694 had a sidelobe of 3 % of a lamp's energy, for which no patterns were found."""
+    monkeypatch.setattr(pursuit, "DOUBTFUL", np.inf)
+    leds, look = posed("leds", 61), look_at("leds", 61)
+    assert look is not None
+    lamp, sidelobe = end_of_lamps(leds.segment), 200
+    wider = widened(leds, look, sidelobe)
+    near = np.abs(wider.basis.held - sidelobe) <= pursuit.BESIDE
+    theta = host(wider.solver.theta).copy()
+    noise = np.random.default_rng(3).standard_normal(theta[near].shape).astype(theta.dtype)
+    energy = np.square(theta[np.abs(wider.basis.held - lamp) <= pursuit.BESIDE]).sum()
+    theta[near] = noise * np.sqrt(0.03 * energy / np.square(noise).sum())
+    wider.solver.theta = theta
+    both = np.array([lamp, sidelobe])
+    found = pursuit._Look(leds, wider, wider.basis.held)
+    np.testing.assert_array_equal(found.needed(both), [lamp])
+    unheld = replace(leds, problem=leds.problem.with_all_samples())
+    found = pursuit._Look(unheld, wider, wider.basis.held)
+    np.testing.assert_array_equal(found.needed(both), both)
+
+
 def test_a_look_that_may_not_iterate_ends() -> None:
     assert pursue(posed("leds", 61), lambda *_: iter(()), lambda: 0) is None
 
