@@ -52,8 +52,7 @@ FAINT = 0.02
 """Energy of a lamp, relative to the brightest one's, below which it may be a sidelobe (up to 0.013, rarely
 0.03): it does not widen the band, but may still be found in the residual of the patterns."""
 DOUBTFUL = 0.1
-"""The same below which the held-out samples have to be predicted worse without it: above, it is a
-lamp."""
+"""The same up to which the held-out samples have to be predicted worse without it."""
 
 
 def pursue(
