@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import subprocess
 import sys
 import time
@@ -14,6 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 from PIL import Image
+from small_files import noise_video, run_with_small_files
 
 from acquire.cli.reconstruct_request import Arguments, requested_lines
 from acquire.config import load_rig
@@ -21,7 +21,7 @@ from acquire.config.scene import ConstantDrive, SineDrive
 from acquire.reconstruct import Options
 from acquire.sim.leds import LedConfig, LedSceneConfig
 from acquire.simulate import simulate
-from acquire.store import open_recording, open_video, write_video
+from acquire.store import open_recording, open_video
 
 Cli = Callable[..., Any]
 
@@ -404,21 +404,7 @@ def test_a_cluster_gives_the_same_result_as_this_machine(
 
 @pytest.mark.parametrize("suffix", [".png", ".gif", ".webp", ".mp4", ".html"])
 def test_a_disk_that_takes_no_more_ends_a_rendering_in_words(tmp_path: Path, suffix: str) -> None:
-    frames = np.random.default_rng(8).random((8, 64, 64)).astype(np.float32)
-    write_video(
-        tmp_path / "v.zarr",
-        frames,
-        np.arange(8, dtype=np.int64),
-        pixel_size=2.5,
-        frame_interval_ns=1,
-        provenance={},
-    )
-    limited = "import resource; resource.setrlimit(resource.RLIMIT_FSIZE, (3000, -1));"
-    program = [sys.executable, "-c", f"{limited} from acquire.cli import main; raise SystemExit(main())"]
-    out = tmp_path / f"v{suffix}"
-    words = ["render", str(tmp_path / "v.zarr"), "--out", str(out)]
-    done = subprocess.run(
-        [*program, *words], capture_output=True, text=True, check=False, env=os.environ | {"COLUMNS": "400"}
-    )
+    video, out = noise_video(tmp_path / "v.zarr"), tmp_path / f"v{suffix}"
+    done = run_with_small_files(3000, "render", video, "--out", out)
     assert (done.returncode, f"{out} cannot be written: " in done.stderr) == (5, True), done.stderr
     assert [path.name for path in tmp_path.iterdir()] == ["v.zarr"]

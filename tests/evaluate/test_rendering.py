@@ -20,14 +20,18 @@ def panel(tmp_path, name, frames, interval_ns, side=12, begin=0):
     video = np.zeros((frames, side, side), np.float32)
     video[np.arange(frames), 0, np.arange(frames) % side] = 1
     video[:, side // 2 :, :] = 0.5
+    return written(tmp_path, name, video, interval_ns, begin)
+
+
+def written(tmp_path, name, video, interval_ns=1000, begin=0, **provenance):
     path = tmp_path / f"{name}.zarr"
     write_video(
         path,
         video,
-        START + begin + np.arange(frames) * interval_ns,
+        START + begin + np.arange(len(video)) * interval_ns,
         pixel_size=1.0,
         frame_interval_ns=interval_ns,
-        provenance={},
+        provenance=provenance,
     )
     return Panel(name, open_video(path))
 
@@ -69,15 +73,7 @@ def test_tiles_that_were_not_reached_are_black_and_the_others_as_usual(tmp_path,
     video = np.full((6, 12, 24), 0.5, np.float32)
     video[:, 0, 0] = 1
     video[:, :, 12:] = np.nan
-    write_video(
-        tmp_path / "v.zarr",
-        video,
-        START + np.arange(6) * 1000,
-        pixel_size=1.0,
-        frame_interval_ns=1000,
-        provenance={"trusted": [0, 0]},
-    )
-    assert render([Panel("v", open_video(tmp_path / "v.zarr"))], tmp_path / f"r{suffix}", Look(48), 6) > 0
+    assert render([written(tmp_path, "v", video, trusted=[0, 0])], tmp_path / f"r{suffix}", Look(48), 6) > 0
     if suffix == ".png":
         with Image.open(tmp_path / "r.png") as sheet:
             values = np.asarray(sheet.convert("L"))
@@ -87,15 +83,7 @@ def test_tiles_that_were_not_reached_are_black_and_the_others_as_usual(tmp_path,
 
 def test_a_video_of_which_nothing_was_reached_is_black(tmp_path):
     video = np.full((3, 12, 12), np.nan, np.float32)
-    write_video(
-        tmp_path / "v.zarr",
-        video,
-        START + np.arange(3) * 1000,
-        pixel_size=1.0,
-        frame_interval_ns=1000,
-        provenance={"trusted": [0, 0]},
-    )
-    assert render([Panel("v", open_video(tmp_path / "v.zarr"))], tmp_path / "r.png", Look(48), 3) == 3
+    assert render([written(tmp_path, "v", video, trusted=[0, 0])], tmp_path / "r.png", Look(48), 3) == 3
 
 
 def test_impossible_renderings_are_refused(tmp_path):

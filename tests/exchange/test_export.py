@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import errno
 import json
-import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -15,6 +14,7 @@ import h5py
 import numpy as np
 import pytest
 import tifffile
+from small_files import noise_video, run_with_small_files
 
 from acquire.exchange import (
     arrays,
@@ -421,19 +421,8 @@ def test_a_disk_that_takes_no_more_is_an_error_and_not_the_end_of_the_process(
     tmp_path: Path, suffix: str, most_bytes: int
 ) -> None:
     """HDF5 itself crashes when it closes a file that it cannot write."""
-    frames = np.random.default_rng(8).random((8, 64, 64)).astype(np.float32)
-    write_video(
-        tmp_path / "v.zarr",
-        frames,
-        np.arange(8, dtype=np.int64),
-        pixel_size=2.5,
-        frame_interval_ns=1,
-        provenance={},
-    )
-    limited = f"import resource; resource.setrlimit(resource.RLIMIT_FSIZE, ({most_bytes}, -1));"
-    program = [sys.executable, "-c", f"{limited} from acquire.cli import main; raise SystemExit(main())"]
-    words = ["export", str(tmp_path / "v.zarr"), str(tmp_path / f"v{suffix}")]
-    done = subprocess.run([*program, *words], capture_output=True, text=True, check=False)
+    video = noise_video(tmp_path / "v.zarr")
+    done = run_with_small_files(most_bytes, "export", video, tmp_path / f"v{suffix}")
     assert (done.returncode, "File too large" in done.stderr) == (5, True), done.stderr
     assert "Traceback" not in done.stderr
     assert [path.name for path in tmp_path.iterdir()] == ["v.zarr"]
