@@ -257,12 +257,10 @@ def _in_patterns(given: Given, first: InBand) -> Estimate | None:
     error, noise = problem.prediction_error(first.predict()), given.noise
     explained = max(SOON_EXPLAINED * noise, LEAST_MISSED) if noise < np.inf else LEAST_MISSED  # NaN: unknown
     clock.reset()  # the limit holds for each stage: the first look takes longer where patterns are in doubt
-    refinement = None
+    refinement = None if usual is None else usual()
     if rivals and not has_clear_patterns(first) and has_time(clock):
-        refinement = _beside_motion(given, usual, rivals, min(error, explained))
+        refinement = _perhaps_beside_motion(given, refinement, rivals, min(error, explained))
         rivals = []
-    if refinement is None and usual is not None:
-        refinement = usual()
     if refinement is not None:
         refinement = settle(given, refinement)
         left = problem.prediction_error(refinement.predict())
@@ -277,18 +275,20 @@ def _in_patterns(given: Given, first: InBand) -> Estimate | None:
     return Refined(refinement, basis.count)
 
 
-def _beside_motion(
+def _perhaps_beside_motion(
     given: Given,
-    usual: Callable[[], Refinement] | None,
+    usual: Refinement | None,
     rivals: Sequence[Callable[[], Refinement]],
     enough: float,
 ) -> Refinement | None:
-    """Patterns beside something that moves, unless the ``usual`` ones soon predict to ``enough``."""
-    soon = np.inf if usual is None else early_error(given, usual())
-    if soon > enough:
-        return better_than(given, BETTER_BESIDE_MOTION * soon, rivals)
+    """Patterns beside something that moves if they are better than the ``usual`` ones, else these.
+
+    They are not tried if the usual ones soon predict to ``enough``.
+    """
+    soon = np.inf if usual is None else early_error(given, usual)
+    other = better_than(given, BETTER_BESIDE_MOTION * soon, rivals) if soon > enough else None
     given.clock.reset()
-    return None
+    return usual if other is None else other
 
 
 def _for_noise(given: Given, first: InBand) -> AdmmParameters:

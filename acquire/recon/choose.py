@@ -21,6 +21,7 @@ from typing import TYPE_CHECKING, ClassVar
 import numpy as np
 
 from acquire.arrays import host
+from acquire.recon.basis import LearnedBasis
 from acquire.recon.blinking import (
     AT_REST,
     FIRST_LOOK_SHARE,
@@ -41,7 +42,14 @@ from acquire.recon.patterns import find_patterns, has_clear_patterns
 from acquire.recon.reuse import reuse_choice
 from acquire.recon.solver import Preset, Solver
 from acquire.recon.still import best_still, change_bench, weighted_like
-from acquire.recon.workbench import BRIGHTER, FIRST_ITERATIONS, GAIN_OF_WEAKER, SEARCH_SHARE, Workbench
+from acquire.recon.workbench import (
+    BRIGHTER,
+    FIRST_ITERATIONS,
+    GAIN_OF_WEAKER,
+    HOPELESS,
+    SEARCH_SHARE,
+    Workbench,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -127,7 +135,8 @@ def _choose(bench: Workbench, volume: Trial, trials: int) -> Estimate:
     tried = _Tried(volume, plain)
     # These are tried even where cosines are ahead: a scene that flickers gains 6.6 to 15 dB by this, a flame
     # up to 3.5. Evident lamps need the time for themselves.
-    if not clear:
+    lamps = isinstance(cosines.basis, LearnedBasis) and tried.best.error > HOPELESS * at_a_glance
+    if not (clear or lamps):
         tried.smooth = bench.probe(bench.fitting(SMOOTH), min(at_a_glance, tried.best.error))
         # The first cosine is constant, so that this is the video's mean over time.
         picture = (cosines.basis.matrix()[0, 0] * host(cosines.solver.theta[0, ...])).clip(0)

@@ -57,9 +57,10 @@ LARGEST_REST = 0.035
 LARGEST_REST_AT_GAP = 0.005
 """The same for patterns that end at a gap; it is smaller, because a bright still can hide what moves before
 it."""
-NEEDED = 2.2
-"""Rise of the held-out error beyond the noise, as energy, from which the weakest pattern is surely needed.
-Without a lamp it rises to 2.5 times and more (1.9 in low light), without a superfluous pattern to twice."""
+NEEDED, SUPERFLUOUS = 2.2, 1.3
+"""Rise of the held-out error beyond the noise, as energy, from which the weakest pattern is surely needed,
+and up to which it surely is not. Without a lamp it rises to 2.5 times and more (1.9 in low light), without a
+superfluous pattern to twice at most, and in most cases to 1.02 to 1.15."""
 FADING = 0.5
 """Power of (largest / own singular value) by which a pattern's λ is larger: weak patterns are smoother."""
 
@@ -272,6 +273,11 @@ class Refinement:
         return int(self.found.curves.shape[1])
 
     @property
+    def rounds(self) -> int:
+        """Number of rounds made so far."""
+        return self._steps // ROUND
+
+    @property
     def at_round_end(self) -> bool:
         return self._steps % ROUND == 0
 
@@ -337,8 +343,10 @@ class Refinement:
         other._admm.rebase(operator, basis, self._theta)
         return other
 
-    def needed(self) -> Patterns:
+    def needed(self, rise: float = NEEDED) -> Patterns:
         """The strongest current patterns, in pixels, without those that the held-out samples may not need.
+
+        These are the weakest, as long as the error without the next of them rises by less than ``rise``.
 
         A pattern of the scene is needed by far, whereas one too many only absorbs errors of the others.
         Without held-out samples all are needed.
@@ -354,22 +362,22 @@ class Refinement:
             patterns = self._given.problem.arrays.asarray(patterns.astype(kept.dtype))
             return replace(found, curves=found.curves @ kept, patterns=patterns)
 
-        noise = self._given.noise
-        floor = noise**2 if noise < np.inf else 0.0  # NaN if it is unknown
-
-        def beyond_noise() -> float:
-            return self._given.problem.prediction_error(self.predict()) ** 2 - floor
-
-        excess, needed = beyond_noise(), self.rank
+        excess, needed = self.excess(), self.rank
         while needed > 1:
             # This is only to predict with fewer: the present ones come back below.
             self.return_to(strongest(needed - 1))
-            without = beyond_noise()
-            if not without < NEEDED * excess:
+            without = self.excess()
+            if not without < rise * excess:
                 break
             excess, needed = without, needed - 1
         self.return_to(found)
         return found if needed == self.rank else strongest(needed)
+
+    def excess(self) -> float:
+        """The energy of the held-out error beyond that of the noise; NaN without held-out samples."""
+        noise = self._given.noise
+        floor = noise**2 if noise < np.inf else 0.0  # NaN if it is unknown
+        return self._given.problem.prediction_error(self.predict()) ** 2 - floor
 
     def predict(self) -> NDArray[Any]:
         """The lines of the estimate, as `Problem.samples`."""

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from acquire.recon.darkness import gains_darkness, in_pixels, lit_pixels, with_light_missing
-from acquire.recon.patterns import ROUND
+from acquire.recon.patterns import NEEDED, ROUND, SUPERFLUOUS
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -69,7 +69,9 @@ stages, trials cost up to 2.3 dB."""
 def settle(given: Given, refinement: Refinement) -> Refinement:
     """Refine until the held-out samples are predicted no better, or the clock ends it: the best state."""
     clock, course = given.clock, _Course(given, refinement)
-    course.refine_until_idle(clock, LOOSENED_IN_VAIN, EARLY_ROUNDS * ROUND)
+    # Rounds in which it was compared with others count, but the course begins with one of its own.
+    early = max(1, EARLY_ROUNDS - refinement.rounds)
+    course.refine_until_idle(clock, LOOSENED_IN_VAIN, early * ROUND)
     course.continue_with(_without_superfluous(given, course.refinement))
     course.try_dark_ground()
     if course.refine_until_idle(clock, LOOSENED_IN_VAIN, TRIAL_AFTER * ROUND):
@@ -142,19 +144,17 @@ class _Course:
         self.before, self.recent, self._idle = self.recent, np.inf, 0
 
     def continue_with(self, refinement: Refinement) -> None:
-        """Continue with another refinement; the best state so far remains the result unless it is beaten."""
+        """Continue with another refinement, whose state is the best from now on."""
         if refinement is not self.refinement:
             self.refinement, self.recent, self._idle = refinement, np.inf, 0
-
-    def try_dark_ground(self) -> None:
-        """Continue with a dark ground, whose state is the best from now on, if it predicts well enough."""
-        if self._doubt > MOST_DOUBT:
-            return
-        refinement = _on_dark_ground(self._given, self.refinement, (1 + self._doubt) * self._best)
-        if refinement is not self.refinement:
-            self.continue_with(refinement)
             self._best = self._problem.prediction_error(refinement.predict())
             self._kept = refinement, refinement.found
+
+    def try_dark_ground(self) -> None:
+        """Continue with a dark ground if it predicts well enough."""
+        if self._doubt <= MOST_DOUBT:
+            enough = (1 + self._doubt) * self._best
+            self.continue_with(_on_dark_ground(self._given, self.refinement, enough))
 
     def at_best(self) -> Refinement:
         """The refinement, returned to its best round."""
@@ -164,12 +164,19 @@ class _Course:
 
 
 def _without_superfluous(given: Given, refinement: Refinement) -> Refinement:
-    """The refinement without doubtful patterns, unless a trial of equally many rounds shows them needed."""
+    """The refinement without superfluous patterns, and without doubtful ones if a trial does as well.
+
+    Both sides of the trial are refined for as many rounds.
+    """
+    refinement = _restricted(refinement, SUPERFLUOUS)
     fewer, clock = _restricted(refinement), given.clock
     if fewer is refinement or clock.iterations < LONG or not clock.affords(LONG * clock.mean_s):
         return fewer
-    without = early_error(given, fewer)
-    return fewer if without <= early_error(given, refinement) else refinement
+    early_error(given, fewer)
+    early_error(given, refinement)
+    # Neither has anything left to explain if both meet the noise. A NaN, without held-out samples, stays one.
+    most = SUPERFLUOUS * max(refinement.excess(), 0.0)
+    return fewer if fewer.excess() <= most else refinement
 
 
 def _without_doubtful(given: Given, refinement: Refinement) -> Refinement:
@@ -237,6 +244,6 @@ def _refine(given: Given, refinement: Refinement, rounds: int) -> float:
     return given.problem.prediction_error(refinement.predict())
 
 
-def _restricted(refinement: Refinement) -> Refinement:
-    needed = refinement.needed()
+def _restricted(refinement: Refinement, rise: float = NEEDED) -> Refinement:
+    needed = refinement.needed(rise)
     return refinement if needed is refinement.found else refinement.restricted(needed)

@@ -26,6 +26,7 @@ from acquire.recon.curves import CurveFit, CurveOperator
 from acquire.recon.lamps import _whitened, last_lamp
 from acquire.recon.patterns import PARAMETERS, Patterns, Refinement, find_patterns
 from acquire.recon.problem import build_problem
+from acquire.recon.settling import _without_superfluous
 
 GEOMETRY = Geometry(12, 3, 72)
 CODE = prbs(64, mix_seed(3, 64), 0, GEOMETRY.span)
@@ -148,6 +149,7 @@ def test_a_pattern_too_many_is_recognised_and_one_of_the_scene_is_not() -> None:
         before = refinement.predict()
         fewer = refinement.needed()
         assert fewer.curves.shape[1] == needed
+        assert _without_superfluous(asked, refinement).rank == needed
         other = refinement.restricted(fewer)
         for _ in range(10):
             other.step()
