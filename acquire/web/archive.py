@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from PIL import Image
 
-from acquire.errors import AcquireError, PlaceError, UsageError
+from acquire.errors import AcquireError, DataError, PlaceError, UsageError
 from acquire.flags import ARMS, NO_IMAGE
 from acquire.store import (
     Recording,
@@ -27,6 +27,7 @@ from acquire.store import (
     open_video,
     taint_words,
 )
+from acquire.store.attributes import upload_target
 from acquire.store.layout import DAMAGE
 from acquire.store.opening import read_root, stated_format
 from acquire.store.refusals import refused
@@ -288,7 +289,7 @@ def _facts(path: Path, opened: Outline) -> RecordingFacts:
         tainted_by=taint_words(info["ledger"].get("tainted_by", {})),
         events=info["events"],
         held=bool(info["holds"]) or any((path / ".holds").glob("*")),
-        uploaded=(opened.attrs.get("config", {}).get("recording") or {}).get("upload_to"),
+        uploaded=upload_target(opened.attrs),
         damage=damage,
     )
 
@@ -308,7 +309,11 @@ def _arm_overview(opened: Recording, arm: str) -> NDArray[np.uint8]:
         if not any(start in rows for rows in kept):
             picture[row] = LOST_COLOUR
             continue
-        lines, flags = stream.read("lines", start, stop), stream.read("flags", start, stop)
+        try:
+            lines, flags = stream.read("lines", start, stop), stream.read("flags", start, stop)
+        except DataError:  # its damage is told in words (`RecordingFacts.damage`), and the rest is shown
+            picture[row] = LOST_COLOUR
+            continue
         no_image = (flags & NO_IMAGE) != 0
         if no_image.all():
             picture[row] = LOST_COLOUR
