@@ -37,6 +37,7 @@ from acquire.trigger.base import TriggerRun
 from acquire.web import archive as archive_module
 from acquire.web.app import Reading, _prepare
 from acquire.web.archive import LINES_PER_ROW, LOST_COLOUR, PICTURE_ROWS, Archive, _arm_overview
+from acquire.web.messages import HoldRequest
 
 CLOCK = ClockFit(90_000_000, 0, 0)
 LOAD = Load(8, "uint16", 1000.0)
@@ -68,6 +69,19 @@ def test_damaged_and_missing_lines_are_shown_as_lost_and_told(tmp_path: Path) ->
         assert (np.delete(picture, (1, 2), axis=0) == 51).all()
     (listed,) = Archive(tmp_path).recordings()
     assert listed.tainted_by == ["arm b: 7 lines that arrived damaged", "tag mismatches: 2"]
+
+
+def test_a_hold_is_listed_before_the_writer_has_seen_it(tmp_path: Path) -> None:
+    """It was looked for in another directory than the one in which it is."""
+    with RecordingWriter.create(tmp_path / "run.zarr", make_spec()) as writer:
+        fill(writer, 150)
+        writer.commit()
+        archive = Archive(tmp_path)
+        assert [found.held for found in archive.recordings()] == [False]
+        archive.hold("run.zarr", HoldRequest(first_line=1000, lines=8, why="flash"))
+        assert [found.held for found in archive.recordings()] == [True]
+        (held,) = archive.recording("run.zarr").hold_list
+        assert (held.first_line, held.count, held.why) == (1000, 8, "flash")
 
 
 def _truncate(path: Path) -> None:
