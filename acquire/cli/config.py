@@ -97,9 +97,12 @@ def check(file: FileArgument, json: JsonFlag = False) -> None:
     Example: [bold]acquire config check rig-demo[/]
     """
     from acquire.config import load_rig, load_scene
+    from acquire.daemon.endpoint import check_path
     from acquire.daemon.host import check_host
     from acquire.daemon.uploads import check_upload
+    from acquire.place import default_socket
     from acquire.rig import check_rig
+    from acquire.web.certificate import tls_context
 
     rig = load_rig(file)
     check_rig(rig)
@@ -108,6 +111,11 @@ def check(file: FileArgument, json: JsonFlag = False) -> None:
     # As `serve` does: what would fail there is refused here, with the rig file at hand.
     check_host(rig)
     check_upload(rig)
+    # The default socket may be replaced by `serve --socket`, and its directory is made when it is needed.
+    if rig.control.socket != default_socket():
+        check_path(rig.control.socket)
+    if rig.web is not None:
+        tls_context(rig.web)
     facts = _facts(rig)
     if json:
         print_json({"file": file, "valid": True, **facts})

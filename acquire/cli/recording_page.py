@@ -74,6 +74,10 @@ def recording_facts(facts: dict[str, Any]) -> dict[str, Any]:
         f"{one['arm']} {one['first_line']} to {one['first_line'] + one['count'] - 1} ({one['why']})"
         for one in facts["suspect"]
     ]
+    # Held lines are kept all the same, and the disk may fill although there is a limit.
+    most, beyond = facts["max_bytes"], ""
+    if facts["holds"] and most is not None and facts["bytes"] > most:
+        beyond = f", more than recording.retention.max_gb allows ({quantity(most, 'B')}): lines are held"
     return {
         "recording": facts["path"],
         "run": facts["run_id"],
@@ -94,7 +98,7 @@ def recording_facts(facts: dict[str, Any]) -> dict[str, Any]:
             f"{key} {shortened(value, 60)}" for key, value in facts["code"].items() if value is not None
         ),
         "clock": f"{facts['clock']['clock_hz']} Hz, {utc}",
-        "size": quantity(facts["bytes"], "B"),
+        "size": quantity(facts["bytes"], "B") + beyond,
         "damaged": facts["damage"],
         "disk": _disk(facts["disk"]),
         "at risk": _at_risk(facts["durability"]),

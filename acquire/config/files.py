@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+import stat
 import tomllib
 from collections.abc import Mapping
 from pathlib import Path
@@ -28,6 +29,8 @@ if TYPE_CHECKING:
 
 MOST_FILE_BYTES = 2**20
 """Largest configuration file; files written by hand have some kilobytes."""
+
+_MODEL = "a file as `acquire config show rig-demo` prints it"
 
 M = TypeVar("M", bound=BaseModel)
 
@@ -67,6 +70,8 @@ def find(name: str | Path, beside: Path | None = None, kind: str = "") -> Path:
     else:
         # A link whose target is gone is a file to `lexists`, and none to `isfile`.
         why = "is not a regular file" if os.path.lexists(name) else "does not exist"
+        if os.path.islink(name) and not os.path.exists(name):  # noqa: PTH110, PTH114
+            why = f"is a link to {shown(os.readlink(name))}, which leads to no file"  # noqa: PTH115
     what = f"{kind} file" if kind else "configuration file"
     near = did_you_mean(str(name), builtin_names(kind))
     raise ConfigError(
@@ -126,8 +131,21 @@ def load_rig(
 def check_directory(rig: RigConfig) -> None:
     """Raise ConfigError unless the directory for recordings exists."""
     directory = rig.recording.directory
-    if not directory.is_dir():
-        raise ConfigError(f"recording.directory: there is no directory {directory}", hint="create it first")
+    try:
+        is_directory = stat.S_ISDIR(directory.stat().st_mode)
+    except FileNotFoundError as error:
+        raise ConfigError(
+            f"recording.directory: there is no directory {directory}", hint="create it first"
+        ) from error
+    except OSError as error:  # a loop of links, a name that is too long, a directory that may not be entered
+        raise ConfigError(
+            f"recording.directory: {shortened(directory)} cannot be used: {error.strerror}",
+            hint="another directory",
+        ) from error
+    if not is_directory:
+        raise ConfigError(
+            f"recording.directory: {directory} is not a directory", hint="the path of a directory"
+        )
 
 
 _SETTINGS = "KEY=VALUE with a TOML value: code.seed=7, name='lab', cameras.a.serial='12'"
@@ -199,13 +217,23 @@ def _read(path: Path) -> dict[str, Any]:
         text = read_regular(path, MOST_FILE_BYTES).decode("utf-8-sig")
         return tomllib.loads(text)
     except UnicodeDecodeError as error:
-        raise ConfigError(f"{path} is not TOML: byte {error.start} is not UTF-8") from error
+        raise ConfigError(
+            f"{path} is not TOML: byte {error.start} is not UTF-8",
+            possible="text in UTF-8",
+            hint=f"an editor that saves as UTF-8; {_MODEL}",
+        ) from error
     except RecursionError as error:
-        raise ConfigError(f"{path} is not TOML: it is nested too deeply") from error
-    except ValueError as error:  # also raised for a number with thousands of digits
-        raise ConfigError(f"{path} is not TOML: {shortened(error, 400)}") from error
+        raise ConfigError(f"{path} is not TOML: it is nested too deeply", hint=_MODEL) from error
+    except tomllib.TOMLDecodeError as error:
+        raise ConfigError(f"{path} is not TOML: {shortened(error, 400)}", hint=_MODEL) from error
+    except ValueError as error:  # Python's own words name a setting of the interpreter
+        raise ConfigError(
+            f"{path} is not TOML: it holds a number of thousands of digits", hint=_MODEL
+        ) from error
     except OSError as error:
-        raise ConfigError(f"{path} cannot be read: {error.strerror}") from error
+        raise ConfigError(
+            f"{path} cannot be read: {error.strerror}", hint="its permissions, or another file"
+        ) from error
 
 
 def _check_kind(table: dict[str, Any], wanted: str, path: Path) -> None:

@@ -34,15 +34,7 @@ class Endpoint:
         Raises UsageError if ``path`` cannot be a socket, StateError if another daemon has it.
         """
         self.path = path
-        if len(os.fsencode(path)) > LONGEST_PATH:
-            raise UsageError(
-                f"control socket {path} has too long a path",
-                possible=f"a path of at most {LONGEST_PATH} bytes",
-                hint=ELSEWHERE,
-            )
-        _check_directory(path)
-        if os.path.lexists(path) and not stat.S_ISSOCK(path.lstat().st_mode):
-            raise UsageError(f"control socket {path}: something else is there, and is left untouched")
+        check_path(path)
         self._closed = False
         self._lock = _lock(path)
         try:
@@ -90,6 +82,21 @@ class Endpoint:
         # Before the lock is released: afterwards the name may be that of the next daemon's socket.
         self.remove()
         self._lock.close()
+
+
+def check_path(path: Path) -> None:
+    """Raise UsageError unless a daemon could listen there, or does."""
+    if len(os.fsencode(path)) > LONGEST_PATH:
+        raise UsageError(
+            f"control socket {path} has too long a path",
+            possible=f"a path of at most {LONGEST_PATH} bytes",
+            hint=ELSEWHERE,
+        )
+    _check_directory(path)
+    if os.path.lexists(path) and not stat.S_ISSOCK(path.lstat().st_mode):
+        raise UsageError(
+            f"control socket {path}: something else is there, and is left untouched", hint=ELSEWHERE
+        )
 
 
 def lock_path(path: Path) -> Path:

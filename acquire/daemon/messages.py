@@ -14,7 +14,15 @@ from pydantic import BaseModel, ConfigDict, Field, PlainSerializer, field_valida
 from acquire import errors
 from acquire.daemon.options import LightCode
 from acquire.daemon.states import State
-from acquire.errors import AcquireError, BusyError, DeviceError, StateError, UsageError
+from acquire.errors import (
+    AcquireError,
+    BusyError,
+    DataError,
+    DeviceError,
+    NoDaemonError,
+    StateError,
+    UsageError,
+)
 from acquire.text import visible
 
 
@@ -383,10 +391,12 @@ HTTP_STATUS: tuple[tuple[type[AcquireError], int], ...] = (
     (UsageError, 422),
     (BusyError, 503),
     (StateError, 409),
+    (NoDaemonError, 503),
     (DeviceError, 503),
+    (DataError, 424),
     (AcquireError, 500),
 )
-"""The first class that matches decides."""
+"""The first class that matches decides. A recording that is damaged is no defect of the server's (500)."""
 
 
 RETRY = {"Retry-After": "1"}

@@ -222,6 +222,14 @@ def upload_target(attributes: dict[str, Any]) -> str | None:
     return found if isinstance(found, str) else None
 
 
+def size_limit_bytes(attributes: dict[str, Any]) -> float | None:
+    """Return the size to which retention keeps a recording, according to its configuration, or None."""
+    found: Any = attributes
+    for key in ("config", "recording", "retention", "max_gb"):
+        found = found.get(key) if isinstance(found, dict) else None
+    return found * 1e9 if type(found) in (int, float) and 0 < found < math.inf else None
+
+
 def check_attributes(attributes: dict[str, Any]) -> None:
     """Raise ValueError, stating the first fault, unless these are valid attributes of a recording."""
     _ROOT(attributes)

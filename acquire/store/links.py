@@ -59,8 +59,7 @@ def refuse_link(root: Path, path: Path) -> None:
 def _odd(root: Path, path: str, kind: str) -> DataError:
     where = os.path.relpath(path, root)
     what = f"is {kind}, not touched" if where == "." else f"holds {kind}, not touched: {where}"
-    return DataError(
-        f"{root} {what}",
-        possible="directories and regular files",
-        hint="the target of the link, or a copy with files in place of links: cp -rL, git annex unlock",
-    )
+    hint = f"a copy of the recording without {kind}"
+    if kind == "a link":
+        hint = "the target of the link, or a copy with files in place of links: cp -rL, git annex unlock"
+    return DataError(f"{root} {what}", possible="directories and regular files", hint=hint)

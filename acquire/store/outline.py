@@ -15,6 +15,7 @@ from acquire.fibre import Fibre
 from acquire.flags import ARMS
 from acquire.geometry import Geometry
 from acquire.store.array_files import COLUMNS, ArmFiles, ArrayFiles
+from acquire.store.attributes import size_limit_bytes
 from acquire.store.files import DISK, is_locked
 from acquire.store.opening import opened
 from acquire.store.source import LocalSource, source_of
@@ -207,6 +208,7 @@ class Outline:
             "start_ns": self._start_ns(),
             "dtype": self.arms["a"].data_type,
             "bytes": self.source.total_bytes(),
+            "max_bytes": size_limit_bytes(self.attrs),
             "segment": self.attrs.get("segment"),
             "segments": self.attrs.get("segments", []),
             "gaps": len(self.gaps),

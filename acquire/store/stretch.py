@@ -17,6 +17,7 @@ import numpy as np
 from acquire.errors import DataError
 from acquire.store.chunks import AbsentChunkError, DamagedChunkError
 from acquire.store.refusals import refusal, shows_damage
+from acquire.text import cause_in_words
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -80,6 +81,6 @@ class Stretch:
     def _damaged(self, error: Exception) -> DataError:
         first, last = self._first_line + self._start, self._first_line + self._stop - 1
         return DataError(
-            f"{self._reader}: lines {first} to {last} cannot be read: {error}",
+            f"{self._reader}: lines {first} to {last} cannot be read: {cause_in_words(error)}",
             hint="`acquire verify` lists the intact lines, `acquire recover` masks the others",
         )

@@ -89,8 +89,10 @@ class _Table:
             raise self._damaged(column, error) from error
 
     def _damaged(self, column: str, error: Exception) -> DataError:
+        # The file's name alone, "0", says nothing.
+        why = "its file c/0 is missing" if isinstance(error, FileNotFoundError) else cause_in_words(error)
         return DataError(
-            f"{self.source}: table {self.name}/{column} cannot be read: {cause_in_words(error)}",
+            f"{self.source}: table {self.name}/{column} cannot be read: {why}",
             hint="acquire verify, which names all that is damaged",
         )
 

@@ -20,6 +20,7 @@ from acquire.store.scan import chunks_of, missing_rows, scan
 from acquire.store.shortfall import Damage, missing_segments
 from acquire.store.source import LocalSource, source_of
 from acquire.store.suspect import suspect_lines
+from acquire.text import cause_in_words
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -179,7 +180,7 @@ def _metadata(recording: Recording) -> Iterator[str]:
         try:
             own = parse_object(recording.source.read(f"{path}/zarr.json"))
         except DAMAGE as error:
-            yield f"{path}/zarr.json cannot be read: {error}"
+            yield f"{path}/zarr.json cannot be read: {cause_in_words(error)}"
             continue
         # Nodes in the root have no consolidated metadata of their own; the files of the groups have.
         if any(own.get(key) != value for key, value in document.items() if key != "consolidated_metadata"):

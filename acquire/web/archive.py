@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from PIL import Image
 
-from acquire.errors import AcquireError, PlaceError, UsageError
+from acquire.errors import AcquireError, DataError, PlaceError, UsageError
 from acquire.flags import ARMS, NO_IMAGE
 from acquire.store import (
     Recording,
@@ -27,9 +27,11 @@ from acquire.store import (
     open_video,
     taint_words,
 )
+from acquire.store.attributes import upload_target
 from acquire.store.layout import DAMAGE
 from acquire.store.opening import read_root, stated_format
 from acquire.store.refusals import refused
+from acquire.store.retention import holds_of
 from acquire.store.shortfall import first_shortfall, missing_segments
 from acquire.store.source import source_of
 from acquire.text import cause_in_words, shortened
@@ -50,6 +52,7 @@ if TYPE_CHECKING:
 
     from acquire.store import Outline, VideoFile
     from acquire.store.layout import Document
+    from acquire.store.retention import Hold
 
 MOST_LISTED = 500
 """Largest number of entries in a list; the newest are listed."""
@@ -115,6 +118,10 @@ class Archive:
             hold_list=[
                 HoldFacts(first_line=int(first), count=int(count), why=str(why[0]) if why else "")
                 for first, count, *why in opened.attrs.get("holds", [])
+            ]
+            + [
+                HoldFacts(first_line=new.first_line, count=new.count, why=new.why)
+                for new in _new_holds(path, opened)
             ],
         )
 
@@ -268,6 +275,12 @@ def _remember(cache: OrderedDict[Any, Any], key: Any, value: Any, most: int) -> 
         cache.popitem(last=False)
 
 
+def _new_holds(path: Path, opened: Outline) -> list[Hold]:
+    """Return the holds that the writer has not listed yet, which it does at its next commit."""
+    listed = {(first, count) for first, count, *_ in opened.attrs.get("holds", [])}
+    return [held for held in holds_of(path) if (held.first_line, held.count) not in listed]
+
+
 def _facts(path: Path, opened: Outline) -> RecordingFacts:
     info = opened.info()
     shortfall = first_shortfall(opened)
@@ -287,8 +300,8 @@ def _facts(path: Path, opened: Outline) -> RecordingFacts:
         lost_lines=info["lost_lines"],
         tainted_by=taint_words(info["ledger"].get("tainted_by", {})),
         events=info["events"],
-        held=bool(info["holds"]) or any((path / ".holds").glob("*")),
-        uploaded=(opened.attrs.get("config", {}).get("recording") or {}).get("upload_to"),
+        held=bool(info["holds"] or _new_holds(path, opened)),
+        uploaded=upload_target(opened.attrs),
         damage=damage,
     )
 
@@ -308,7 +321,11 @@ def _arm_overview(opened: Recording, arm: str) -> NDArray[np.uint8]:
         if not any(start in rows for rows in kept):
             picture[row] = LOST_COLOUR
             continue
-        lines, flags = stream.read("lines", start, stop), stream.read("flags", start, stop)
+        try:
+            lines, flags = stream.read("lines", start, stop), stream.read("flags", start, stop)
+        except DataError:  # its damage is told in words (`RecordingFacts.damage`), and the rest is shown
+            picture[row] = LOST_COLOUR
+            continue
         no_image = (flags & NO_IMAGE) != 0
         if no_image.all():
             picture[row] = LOST_COLOUR

@@ -7,7 +7,6 @@ import contextlib
 import logging
 import signal
 import socket as sockets
-import ssl
 from typing import TYPE_CHECKING
 
 import uvicorn
@@ -17,9 +16,11 @@ from acquire.daemon.connections import Connection, raise_descriptor_limit
 from acquire.errors import NoDaemonError, UsageError
 from acquire.processes.rank import EARLY, stand_back
 from acquire.web.app import build_page
+from acquire.web.certificate import tls_context
 from acquire.web.tokens import TokenFile, load_tokens
 
 if TYPE_CHECKING:
+    import ssl
     from collections.abc import Iterator
     from pathlib import Path
 
@@ -45,17 +46,7 @@ def serve_page(socket: Path, directory: Path, config: WebConfig) -> None:
     signal.signal(signal.SIGTTOU, signal.SIG_IGN)
     raise_descriptor_limit()
     tokens = TokenFile(config.token_path(socket))
-    context = None
-    if config.certificate is not None:
-        context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
-        context.minimum_version = ssl.TLSVersion.TLSv1_2  # earlier versions are deprecated (RFC 8996)
-        try:
-            context.load_cert_chain(config.certificate, config.key)
-        except (OSError, ssl.SSLError) as error:
-            raise UsageError(
-                f"web.certificate {config.certificate} and its key cannot be used: {error}",
-                possible="PEM files",
-            ) from error
+    context = tls_context(config)
     family = sockets.AF_INET6 if ":" in config.host else sockets.AF_INET
     with contextlib.closing(sockets.socket(family, sockets.SOCK_STREAM)) as listener:
         # Otherwise a page that is restarted would have to wait for old connections to time out.

@@ -164,6 +164,57 @@ def test_the_directory_of_recordings_must_exist(cli: Cli, rig_file: Path) -> Non
     assert "/nowhere" in answer.err
 
 
+@pytest.mark.parametrize(
+    ("key", "value", "words"),
+    [
+        ("recording.directory", "{file}", "is not a directory"),
+        ("recording.directory", "{loop}", "Too many levels of symbolic links"),
+        ("recording.directory", "/tmp/" + "x" * 300, "File name too long"),
+        ("control.socket", "{file}", "something else is there"),
+        ("control.socket", "/nowhere/c.sock", "its directory does not exist"),
+        ("control.socket", "/tmp/" + "x" * 200, "a path of at most 107 bytes"),
+        ("web.certificate", "/nowhere/c.pem", "No such file or directory"),
+        ("web.certificate", "{file}", "PEM"),
+    ],
+)
+def test_a_place_that_serve_would_refuse_is_found_by_check(
+    cli: Cli, rig_file: Path, key: str, value: str, words: str
+) -> None:
+    loop = rig_file.with_name("loop")
+    loop.symlink_to(loop)
+    table, name = key.split(".")
+    value = value.format(file=rig_file, loop=loop)
+    more = f'\nkey = "{value}"' if name == "certificate" else ""
+    lines = f'[{table}]\n{name} = "{value}"{more}\n'
+    text = rig_file.read_text()
+    rig_file.write_text(text.replace(f"[{table}]\n", lines) if f"[{table}]\n" in text else text + lines)
+    answer = cli("config", "check", rig_file)
+    assert answer.code == 2
+    assert words in answer.err
+    assert "  try: " in answer.err
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        (b'name = "\xe9"', "byte 8 is not UTF-8\n  possible: text in UTF-8"),
+        (b"stages = ", "Invalid value (at end of document)\n  try: a file as"),
+        (b"stages = " + b"9" * 5000, "not TOML: it holds a number of thousands of digits\n  try: a file as"),
+    ],
+)
+def test_what_is_no_toml_is_told_with_advice(cli: Cli, rig_file: Path, content: bytes, words: str) -> None:
+    rig_file.write_bytes(content)
+    assert words in cli("config", "check", rig_file).err
+
+
+def test_a_link_to_nowhere_is_told_as_one(cli: Cli, rig_file: Path) -> None:
+    link = rig_file.with_name("link.toml")
+    for target in ("absent.toml", link.name):
+        link.unlink(missing_ok=True)
+        link.symlink_to(target)
+        assert f"is a link to '{target}', which leads to no file" in cli("config", "check", link).err
+
+
 def test_a_directory_is_not_a_file(cli: Cli, tmp_path: Path) -> None:
     assert "is a directory" in cli("config", "check", tmp_path).err
 

@@ -343,6 +343,19 @@ def test_hold_keeps_lines_of_a_recording_that_grows(cli: Cli, tmp_path: Path) ->
         assert cli("cut", path, "--first-line", FIRST, "--lines", 5, "--out", tmp_path / "c.npz").code == 0
 
 
+def test_a_held_recording_beyond_its_limit_says_so(cli: Cli, tmp_path: Path) -> None:
+    path, limit = tmp_path / "endless.zarr", {"recording": {"retention": {"max_gb": 2e-6}}}
+    policy = Retention(max_bytes=2000, margin_lines=4)
+    small = replace(spec(), config=limit, retention=policy, shard_chunks=1)
+    with RecordingWriter.create(path, small) as writer:
+        assert "max_gb" not in cli("info", path).out  # nothing is held
+        cli("hold", path, "--first-line", FIRST, "--lines", 10)
+        for arm in ARMS:
+            writer.append(block(arm, range(0)))
+        writer.commit()
+        assert "more than recording.retention.max_gb allows (2 kB): lines are held" in cli("info", path).out
+
+
 def test_an_export_begins_with_the_first_line_that_is_left(cli: Cli, tmp_path: Path) -> None:
     path = tmp_path / "endless.zarr"
     policy = Retention(max_age_lines=16, margin_lines=4)

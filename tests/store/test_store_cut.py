@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import os
+import shutil
 from dataclasses import replace
 
 import numpy as np
@@ -11,7 +13,7 @@ from store_helpers import CAMERA, CODE, Truth, array_of, fill, make_spec, with_a
 
 from acquire.errors import DataError, UsageError
 from acquire.lines import ARMS, LineFlag
-from acquire.store import RecordingWriter, RunCondition, open_recording
+from acquire.store import RecordingWriter, RunCondition, open_recording, verify
 
 
 @pytest.fixture(scope="module")
@@ -180,6 +182,34 @@ def test_a_lost_file_is_not_taken_for_darkness(tmp_path):
     with pytest.raises(DataError, match="line 1064 is recorded, but not on disk"):
         recording.cut(1060, 20)
     assert recording.cut(1000, 64).mask.all()
+
+
+def test_what_took_the_place_of_a_file_is_told_in_words(tmp_path):
+    recording = write(tmp_path / "r.zarr", make_spec(), lambda block: block)
+    file = recording.path / "a" / "lines" / "c" / "0" / "0"
+    file.unlink()
+    file.mkdir()
+    with pytest.raises(DataError, match="lines 1000 to 1009 cannot be read: it is a directory, not a file;"):
+        open_recording(recording.path).cut(1000, 10)
+
+
+def test_a_table_whose_file_is_gone_is_told_in_words(tmp_path):
+    recording = write(tmp_path / "r.zarr", make_spec(), lambda block: block)
+    with RecordingWriter.create(tmp_path / "e.zarr", make_spec()) as writer:
+        writer.add_event("mark", 5, 1000, "here")
+        writer.seal(RunCondition.GOOD, "done", {})
+    shutil.rmtree(tmp_path / "e.zarr" / "events" / "text")
+    with pytest.raises(DataError, match="table events/text cannot be read: its file c/0 is missing"):
+        open_recording(tmp_path / "e.zarr").info()
+    shutil.rmtree(recording.path / "overview")
+    assert "overview/zarr.json cannot be read: zarr.json is missing" in verify(recording.path).contradictions
+
+
+def test_the_advice_for_a_pipe_is_not_that_for_a_link(tmp_path):
+    recording = write(tmp_path / "r.zarr", make_spec(), lambda block: block)
+    os.mkfifo(recording.path / "a" / "pipe")
+    with pytest.raises(DataError, match=r"holds a pipe, not touched: a/pipe; .*without a pipe"):
+        verify(recording.path)
 
 
 def test_a_damaged_chunk_is_told(tmp_path):

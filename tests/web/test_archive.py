@@ -4,12 +4,17 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import json
 import os
 import shutil
+from collections.abc import Callable
 from pathlib import Path
 
+import httpx
 import numpy as np
 import pytest
+from page_server import PageServer
+from store_helpers import fill, make_spec
 
 from acquire.capacity.load import Load, recording_spec
 from acquire.clock import ClockFit
@@ -32,6 +37,7 @@ from acquire.trigger.base import TriggerRun
 from acquire.web import archive as archive_module
 from acquire.web.app import Reading, _prepare
 from acquire.web.archive import LINES_PER_ROW, LOST_COLOUR, PICTURE_ROWS, Archive, _arm_overview
+from acquire.web.messages import HoldRequest
 
 CLOCK = ClockFit(90_000_000, 0, 0)
 LOAD = Load(8, "uint16", 1000.0)
@@ -63,6 +69,76 @@ def test_damaged_and_missing_lines_are_shown_as_lost_and_told(tmp_path: Path) ->
         assert (np.delete(picture, (1, 2), axis=0) == 51).all()
     (listed,) = Archive(tmp_path).recordings()
     assert listed.tainted_by == ["arm b: 7 lines that arrived damaged", "tag mismatches: 2"]
+
+
+def test_a_hold_is_listed_before_the_writer_has_seen_it(tmp_path: Path) -> None:
+    """It was looked for in another directory than the one in which it is."""
+    with RecordingWriter.create(tmp_path / "run.zarr", make_spec()) as writer:
+        fill(writer, 150)
+        writer.commit()
+        archive = Archive(tmp_path)
+        assert [found.held for found in archive.recordings()] == [False]
+        archive.hold("run.zarr", HoldRequest(first_line=1000, lines=8, why="flash"))
+        assert [found.held for found in archive.recordings()] == [True]
+        (held,) = archive.recording("run.zarr").hold_list
+        assert (held.first_line, held.count, held.why) == (1000, 8, "flash")
+
+
+def _truncate(path: Path) -> None:
+    os.truncate(path, path.stat().st_size // 2)
+
+
+def _set_config(root: Path, recording: object) -> None:
+    document = json.loads(root.read_text())
+    document["attributes"]["config"] = {"recording": recording}
+    root.write_text(json.dumps(document))
+
+
+def test_no_damage_is_answered_as_a_defect_of_the_server(tmp_path: Path) -> None:
+    """500 stands for a defect; of a damaged recording it said so as well, and of one with an odd `config`."""
+    with RecordingWriter.create(tmp_path / "whole.zarr", make_spec()) as writer:
+        fill(writer, 150)
+        writer.add_event("mark", 5, 1000, "here")
+        writer.seal(RunCondition.GOOD, "done", {})
+    damages: dict[str, Callable[[Path], object]] = {
+        "lines": lambda path: _truncate(path / "a" / "lines" / "c" / "0" / "0"),
+        "arm": lambda path: shutil.rmtree(path / "b"),
+        "events": lambda path: _truncate(path / "events" / "text" / "c" / "0"),
+        "root": lambda path: _truncate(path / "zarr.json"),
+        "no-root": lambda path: (path / "zarr.json").unlink(),
+        "text": lambda path: _set_config(path / "zarr.json", "x"),
+        "number": lambda path: _set_config(path / "zarr.json", {"upload_to": 5}),
+    }
+    for name, damage in damages.items():
+        damage(shutil.copytree(tmp_path / "whole.zarr", tmp_path / f"{name}.zarr"))
+    os.mkfifo(tmp_path / "pipe.zarr")
+    (tmp_path / "loop.zarr").symlink_to("loop.zarr")
+    shutil.copytree(tmp_path / "whole.zarr", os.fsdecode(os.fsencode(tmp_path) + b"/caf\xe9.zarr"))
+    answers: dict[tuple[str, str], httpx.Response] = {}
+    with (
+        contextlib.closing(PageServer(tmp_path / "c.sock", tmp_path)) as page,
+        httpx.Client(
+            base_url=f"{page.address}api", headers={"Authorization": f"Bearer {page.operator}"}, timeout=60
+        ) as ask,
+    ):
+        listed = {found["name"]: found for found in ask.get("/recordings").json()}
+        for name in (*damages, "whole", "pipe", "loop", "caf%E9"):
+            for of in ("", "/picture"):
+                answers[name, of] = ask.get(f"/recordings/{name}.zarr{of}")
+            answers[name, "/hold"] = ask.post(
+                f"/recordings/{name}.zarr/hold", json={"first_line": 1000, "lines": 8}
+            )
+        assert ask.get("/health").status_code == 503  # there is no daemon
+    codes = {place: answer.status_code for place, answer in answers.items()}
+    assert set(codes.values()) == {200, 422, 424}, codes
+    assert all("message" in answer.json() for answer in answers.values() if answer.status_code != 200)
+    assert len(listed) == len(damages) + 2
+    # What can be shown is shown.
+    assert {codes[name, of] for name in ("lines", "arm", "text", "number") for of in ("", "/picture")} == {
+        200
+    }
+    assert "cut short" in listed["lines.zarr"]["damage"]
+    assert codes["events", ""] == codes["root", "/picture"] == codes["no-root", "/hold"] == 424
 
 
 def test_the_first_list_is_made_before_anybody_asks(tmp_path: Path) -> None:
