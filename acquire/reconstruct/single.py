@@ -7,7 +7,7 @@ from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
 from acquire import __version__
-from acquire.plugins import SOLVERS, of_others
+from acquire.plugins import DENOISERS, SOLVERS, of_others
 from acquire.recon.error import error_facts
 from acquire.store import write_video
 
@@ -56,6 +56,7 @@ def describe(result: Reconstruction, recording: Recording, segment: Segment) -> 
         "first_line": segment.first_line,
         "lines": segment.geometry.lines,
         "solver": result.solver,
+        "denoiser": result.denoiser,
         "iterations": result.iterations,
         "iterations_asked": result.iterations_asked,
         "seconds": round(result.seconds, 3),
@@ -65,5 +66,5 @@ def describe(result: Reconstruction, recording: Recording, segment: Segment) -> 
         "trusted": [result.trusted.start, result.trusted.stop],
         "warnings": list(result.warnings),
         "versions": {"acquire": __version__},
-        "plugins": of_others([(SOLVERS, result.solver)]),
+        "plugins": of_others([(SOLVERS, result.solver), (DENOISERS, result.denoiser or "")]),
     }
