@@ -137,7 +137,7 @@ def test_arms_with_cameras_of_their_own(tmp_path):
         (("cameras",), []),
     ],
 )
-def test_damaged_metadata_is_told_when_the_recording_is_opened(tmp_path, keys, value):
+def test_damaged_metadata_is_refused_when_the_recording_is_opened(tmp_path, keys, value):
     path = write(tmp_path / "r.zarr", make_spec(), lambda block: block).path
     document = json.loads((path / "zarr.json").read_text())
     table = document["attributes"]
@@ -150,7 +150,7 @@ def test_damaged_metadata_is_told_when_the_recording_is_opened(tmp_path, keys, v
 
 
 @pytest.mark.parametrize("attribute", ["flag_values", "flag_meanings"])
-def test_a_damaged_table_is_told_when_it_is_read_and_the_lines_stay(tmp_path, attribute):
+def test_a_damaged_table_is_refused_when_it_is_read_and_the_lines_stay(tmp_path, attribute):
     recording = write(tmp_path / "r.zarr", make_spec(), lambda block: block)
     for file in (recording.path / "zarr.json", recording.path / "gaps" / "arm" / "zarr.json"):
         file.write_text(file.read_text().replace(attribute, "gone"))
@@ -182,7 +182,7 @@ def test_a_lost_file_is_not_taken_for_darkness(tmp_path):
     assert recording.cut(1000, 64).mask.all()
 
 
-def test_a_damaged_chunk_is_told(tmp_path):
+def test_lines_of_a_damaged_chunk_are_refused(tmp_path):
     recording = write(tmp_path / "r.zarr", make_spec(codec="none"), lambda block: block)
     with (tmp_path / "r.zarr" / "a" / "lines" / "c" / "0" / "0").open("r+b") as file:
         file.seek(2 * 4096)
