@@ -24,9 +24,10 @@ def save_reconstruction(
 ) -> dict[str, Any]:
     """Write the whole video of a reconstruction as OME-Zarr and return the provenance written with it.
 
-    ``provenance.trusted`` holds the first fully sampled frame and the one after the last. The frames around
-    them are included because the lines depend on them, not because they can be trusted. The side of a voxel
-    is given in pixels of the scene at full resolution, the only length that is known.
+    ``provenance.trusted`` holds the first fully sampled frame and the one after the last; it is empty if the
+    lines contradict their description (`Reconstruction.believed`). The frames around them are included
+    because the lines depend on them, not because they can be trusted. The side of a voxel is given in pixels
+    of the scene at full resolution, the only length that is known. Raises what `write_video` raises.
     """
     provenance = describe(result, recording, segment)
     interval_ns = segment.substep_ns * float(provenance["parameters"]["temporal_merge"])
@@ -49,6 +50,8 @@ def save_reconstruction(
 
 def describe(result: Reconstruction, recording: Recording, segment: Segment) -> dict[str, Any]:
     """Return origin and quality of a video as JSON."""
+    # As in stitched videos, since the interval follows from the geometry alone.
+    trusted = result.trusted if result.believed else slice(result.trusted.start, result.trusted.start)
     quality = {key: value if math.isfinite(value) else None for key, value in asdict(result.quality).items()}
     return {
         "recording": str(recording),
@@ -63,7 +66,7 @@ def describe(result: Reconstruction, recording: Recording, segment: Segment) -> 
         "parameters": result.parameters,
         "quality": quality,
         "error": error_facts(result.error),
-        "trusted": [result.trusted.start, result.trusted.stop],
+        "trusted": [trusted.start, trusted.stop],
         "warnings": list(result.warnings),
         "versions": {"acquire": __version__},
         "plugins": of_others([(SOLVERS, result.solver), (DENOISERS, result.denoiser or "")]),

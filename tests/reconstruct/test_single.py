@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import pytest
@@ -34,6 +35,21 @@ def test_the_denoiser_is_recorded_with_the_solver(
     save_reconstruction(tmp_path / "v.zarr", result, recording, segment, MERGES[0])
     provenance = open_video(tmp_path / "v.zarr").attrs["provenance"]
     assert (provenance["solver"], provenance["denoiser"]) == ("admm", name)
+
+
+def test_no_frame_is_trusted_if_the_lines_contradict_their_description(
+    recording_path: Path, tmp_path: Path
+) -> None:
+    """The geometry alone was asked, as if nothing had been found; stitched videos had none."""
+    recording = open_recording(recording_path)
+    segment = recording.cut(0, LINES)
+    result = reconstruct(segment, *MERGES, iterations=3, check=False, error=False)
+    for believed, frames in ((True, len(result.video[result.trusted])), (False, 0)):
+        path = tmp_path / f"{believed}.zarr"
+        save_reconstruction(path, replace(result, believed=believed), recording, segment, MERGES[0])
+        trusted = open_video(path).trusted
+        assert trusted is not None
+        assert len(trusted) == frames
 
 
 def test_a_stitched_video_records_them_by_the_same_names(recording_path: Path, tmp_path: Path) -> None:
