@@ -113,10 +113,17 @@ def stream_of(recording: Recording) -> Stream:
 
 
 def by_lines(recording: Recording, first_line: int | None = None, lines: int | None = None) -> Selection:
-    """Select exactly these lines. Raises UsageError for lines that the recording does not have."""
+    """Select exactly these lines, by default all to the end.
+
+    Raises UsageError for lines that the recording does not have, and for fewer than one.
+    """
     whole = stream_of(recording)
     first = whole.first_line if first_line is None else first_line
-    check_integers(first_line=first, lines=0 if lines is None else lines)
+    check_integers(first_line=first, lines=1 if lines is None else lines)
+    if lines is not None and lines < 1:
+        raise UsageError(
+            f"a range of {lines} lines cannot be selected", possible="1 or more, or None for all"
+        )
     end = whole.end_line if lines is None else first + lines
     if not whole.first_line <= first < end <= whole.end_line:
         possible = f"lines {whole.first_line} to {whole.end_line - 1}" if recording.lines else "no lines yet"
