@@ -65,7 +65,11 @@ class Rig:
     def simulated(self) -> SimulatedDevices:
         """The simulated devices of the rig. Raises UsageError if all devices are real."""
         if self._simulated is None:
-            raise UsageError(f"rig {self.config.name} has no simulated device")
+            raise UsageError(
+                f"rig {self.config.name} has no simulated device",
+                possible="a camera or trigger whose driver is a simulated one",
+                hint="acquire plugins, which lists the drivers",
+            )
         return self._simulated
 
     def describe(self) -> dict[str, Any]:

@@ -69,6 +69,11 @@ OF_LINES: dict[str, tuple[Callable[[Any], Any], str]] = {
     "whole lines": (lambda r: r.whole_lines(0.5, 10), r"first_line cannot be 0\.5; possible"),
     "by lines": (lambda r: by_lines(r, 0.5, 10), r"first_line cannot be 0\.5; possible"),  # type: ignore[arg-type]
     "by lines text": (lambda r: by_lines(r, "0", 10), "first_line cannot be '0'; possible"),  # type: ignore[arg-type]
+    "no lines": (lambda r: r.cut(5, 0), "a range of 0 lines cannot be read; possible: 1 or more"),
+    "by no lines": (
+        lambda r: by_lines(r, 5, 0),
+        "a range of 0 lines cannot be selected; possible: 1 or more",
+    ),
     "by time": (lambda r: by_time(r, nan, None), "begin_ns cannot be nan; possible: nanosec"),  # type: ignore[arg-type]
     "longest": (
         lambda r: in_voxels(by_lines(r), Voxels(6, 10), longest=0),

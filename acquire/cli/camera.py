@@ -135,5 +135,6 @@ def _check_out(path: Path) -> None:
         )
     if not path.absolute().parent.is_dir():
         raise UsageError(
-            f"a snapshot cannot be saved to {path}: there is no directory {path.absolute().parent}"
+            f"a snapshot cannot be saved to {path}: there is no directory {path.absolute().parent}",
+            hint="--out in a directory that exists",
         )

@@ -205,7 +205,9 @@ def _levels(known: Mapping[str, float], options: Mapping[str, float | None]) -> 
     levels = {**known, **{key: value for key, value in options.items() if value is not None}}
     black, white = levels.get("black_level_dn", 0.0), levels.get("white_dn", math.inf)
     if black >= white:
-        raise UsageError(f"the black level, {black:g} DN, is not below white, {white:g} DN")
+        raise UsageError(
+            f"the black level, {black:g} DN, is not below white, {white:g} DN", hint="--black and --white"
+        )
     return levels
 
 

@@ -210,7 +210,11 @@ def shifted(code: Code, start: int) -> Code:
     if isinstance(code, ListedCode):
         count = code.length if code.repeats else code.length - start
         if count < 1:
-            raise UsageError(f"--code-start {start} is beyond the {code.length} bits of the code")
+            raise UsageError(
+                f"--code-start {start} is beyond the {code.length} bits of the code",
+                possible=f"0 to {code.length - 1}",
+                hint="--code-repeats, if the code began anew after its last bit",
+            )
         return ListedCode.of(code.bits(start, count), repeats=code.repeats)
     # A constant code is the same from any bit on.
     return code

@@ -166,6 +166,7 @@ def reconstruct(
         result = run.result(estimate, check=check, error=error, cut=cut)
     return replace(
         result,
+        denoiser=denoiser if denoiser is None or isinstance(denoiser, str) else type(denoiser).__name__,
         warnings=(*balance_warnings, *result.warnings),
         parameters={**result.parameters, **balance_facts},
     )

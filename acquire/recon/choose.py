@@ -208,15 +208,15 @@ def _search(bench: Workbench, tried: _Tried, trials: int, rival: float) -> Trial
     flickers = bright is not None and bench.held_out.clearly_less(bright.errors, plain.errors)
     if bright is not None and flickers and bright.error < BRIGHTER * volume.error:
         volume = bright
+    # Where much moves, a still is not searched further, and is no ground for a change.
     if plain.error < FAR * volume.error:
         explains = plain.error < AT_REST
         merge = bench.given.options.spatial_merge
         still = best_still(plain, trials, merge=merge) if explains else bench.climb(plain, trials)
-    # Where much moves, the still was not searched further, and is no ground for a change.
-    if still is not plain:
-        candidate = replace(weighted_like(still, bench.fitting(VOLUME)), change=True)
-        change = change_bench(bench, still).attempt(candidate, FIRST_ITERATIONS)
-        volume = min((volume, change), key=_error)
+        if not bench.clock.spent(SEARCH_SHARE):
+            candidate = replace(weighted_like(still, bench.fitting(VOLUME)), change=True)
+            change = change_bench(bench, still).attempt(candidate, FIRST_ITERATIONS)
+            volume = min((volume, change), key=_error)
     if volume.error < FAR * rival:
         volume = volume.bench.climb(volume, trials)
         if volume.candidate.brightness:

@@ -125,7 +125,7 @@ def _check_array(what: str, given: NDArray[Any] | None, shape: tuple[int, ...]) 
     if np.shape(given) != shape:
         raise UsageError(f"{what} of shape {np.shape(given)} does not fit", possible=f"{shape}")
     if not np.isfinite(given).all():
-        raise UsageError(f"{what} has values that are not finite")
+        raise UsageError(f"{what} has values that are not finite", possible="finite numbers")
     if np.min(given) < -NEGATIVE_SHARE * np.max(np.abs(given)):
         raise UsageError(
             f"{what} has values down to {np.min(given):.3g}", possible="light: 0 or more, in any units"

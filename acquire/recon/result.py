@@ -95,6 +95,9 @@ class Reconstruction:
     time_ns : the beginning of each frame
     seconds : wall time without ``compiled_s``, the time of compilation, once after an installation
     processor_s : processor time of all threads
+    solver : its name
+    denoiser : name of the one that replaced total variation, or of its class if it was given as an object;
+        None without
     iterations : number of all iterations, trials included; those limited by ``iterations_asked`` may be fewer
         if the budget, ``stop`` or the data ended them (``ended``)
     frame_error : (time,) relative RMS residual of the samples that saw each frame; NaN if none did. It is not
@@ -123,6 +126,7 @@ class Reconstruction:
     warnings: tuple[str, ...] = ()
     compiled_s: float = 0.0
     processor_s: float = 0.0
+    denoiser: str | None = None
     parameters: dict[str, Any] = field(default_factory=dict)
 
     def __repr__(self) -> str:

@@ -144,11 +144,13 @@ class _Course:
         self.before, self.recent, self._idle = self.recent, np.inf, 0
 
     def continue_with(self, refinement: Refinement) -> None:
-        """Continue with another refinement, whose state is the best from now on."""
+        """Continue with another refinement, whose state is the best from now on if it predicts as well."""
         if refinement is not self.refinement:
             self.refinement, self.recent, self._idle = refinement, np.inf, 0
-            self._best = self._problem.prediction_error(refinement.predict())
-            self._kept = refinement, refinement.found
+            error = self._problem.prediction_error(refinement.predict())
+            # A NaN, without held-out samples, makes it the best, too.
+            if not error > (1 + self._doubt) * self._best:
+                self._best, self._kept = error, (refinement, refinement.found)
 
     def try_dark_ground(self) -> None:
         """Continue with a dark ground if it predicts well enough."""

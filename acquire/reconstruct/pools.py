@@ -212,7 +212,10 @@ def _cluster(address: str) -> Iterator[Cluster]:
         ) from error
     with client:
         if not client.scheduler_info(n_workers=-1)["workers"]:
-            raise UsageError(f"the Dask cluster on {address} has no workers")
+            raise UsageError(
+                f"the Dask cluster on {address} has no workers",
+                hint=f"dask worker {address}, on every machine",
+            )
         yield Cluster(client)
 
 

@@ -7,7 +7,7 @@ from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
 from acquire import __version__
-from acquire.plugins import SOLVERS, of_others
+from acquire.plugins import DENOISERS, SOLVERS, of_others
 from acquire.recon.error import error_facts
 from acquire.store import write_video
 
@@ -24,9 +24,10 @@ def save_reconstruction(
 ) -> dict[str, Any]:
     """Write the whole video of a reconstruction as OME-Zarr and return the provenance written with it.
 
-    ``provenance.trusted`` holds the first fully sampled frame and the one after the last. The frames around
-    them are included because the lines depend on them, not because they can be trusted. The side of a voxel
-    is given in pixels of the scene at full resolution, the only length that is known.
+    ``provenance.trusted`` holds the first fully sampled frame and the one after the last; it is empty if the
+    lines contradict their description (`Reconstruction.believed`). The frames around them are included
+    because the lines depend on them, not because they can be trusted. The side of a voxel is given in pixels
+    of the scene at full resolution, the only length that is known. Raises what `write_video` raises.
     """
     provenance = describe(result, recording, segment)
     interval_ns = segment.substep_ns * float(provenance["parameters"]["temporal_merge"])
@@ -49,6 +50,8 @@ def save_reconstruction(
 
 def describe(result: Reconstruction, recording: Recording, segment: Segment) -> dict[str, Any]:
     """Return origin and quality of a video as JSON."""
+    # As in stitched videos, since the interval follows from the geometry alone.
+    trusted = result.trusted if result.believed else slice(result.trusted.start, result.trusted.start)
     quality = {key: value if math.isfinite(value) else None for key, value in asdict(result.quality).items()}
     return {
         "recording": str(recording),
@@ -56,14 +59,15 @@ def describe(result: Reconstruction, recording: Recording, segment: Segment) -> 
         "first_line": segment.first_line,
         "lines": segment.geometry.lines,
         "solver": result.solver,
+        "denoiser": result.denoiser,
         "iterations": result.iterations,
         "iterations_asked": result.iterations_asked,
         "seconds": round(result.seconds, 3),
         "parameters": result.parameters,
         "quality": quality,
         "error": error_facts(result.error),
-        "trusted": [result.trusted.start, result.trusted.stop],
+        "trusted": [trusted.start, trusted.stop],
         "warnings": list(result.warnings),
         "versions": {"acquire": __version__},
-        "plugins": of_others([(SOLVERS, result.solver)]),
+        "plugins": of_others([(SOLVERS, result.solver), (DENOISERS, result.denoiser or "")]),
     }

@@ -81,7 +81,10 @@ def checked_light(light: Any, shape: tuple[int, ...], what: str) -> NDArray[np.f
         raise UsageError(f"the light of {what} has shape {frames.shape}", possible=f"{shape}")
     if not np.isfinite(frames).all():
         nan, infinite = int(np.isnan(frames).sum()), int(np.isinf(frames).sum())
-        raise UsageError(f"the light of {what} is not finite: {nan} pixels are NaN, {infinite} infinite")
+        raise UsageError(
+            f"the light of {what} is not finite: {nan} pixels are NaN, {infinite} infinite",
+            possible="finite numbers, 0 or more",
+        )
     if frames.size and frames.min() < 0:
         raise UsageError(
             f"the light of {what} must not be negative, but is as low as {frames.min():g}",
@@ -114,5 +117,8 @@ def load_function(name: str) -> LightFunction:
     except Exception as error:  # as above: a file is run, and a module imported
         raise _raised(f"scene function {name!r}", error) from error
     if not callable(found):
-        raise UsageError(f"scene function {name!r} cannot be loaded: {place} has no function {attribute}")
+        raise UsageError(
+            f"scene function {name!r} cannot be loaded: {place} has no function {attribute}",
+            possible="MODULE:FUNCTION or FILE.py:FUNCTION",
+        )
     return found  # type: ignore[no-any-return]

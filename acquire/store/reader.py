@@ -222,16 +222,18 @@ class Recording(Outline):
         return next((s for s in self.segments if s.first_line <= line < s.first_line + s.lines), None)
 
     def _rows(self, first_line: int, lines: int) -> tuple[int, int]:
+        if lines < 1:
+            raise UsageError(f"a range of {lines} lines cannot be read", possible="1 or more")
         start = first_line - self.first_line
         # First: dropped lines count among the recording's, and the second check would let them pass.
         for first, count in self.dropped:
-            if lines > 0 and first < first_line + lines and first_line < first + count:
+            if first < first_line + lines and first_line < first + count:
                 raise DataError(
                     f"{self}: lines {first} to {first + count - 1} were dropped by retention",
                     possible=f"lines {self.first_available_line} to {self.first_line + self.lines - 1}",
                     hint="`acquire hold` keeps lines while a recording is being written",
                 )
-        if lines < 1 or start < 0 or start + lines > self.lines:
+        if start < 0 or start + lines > self.lines:
             have = (
                 f"lines {self.first_line} to {self.first_line + self.lines - 1}"
                 if self.lines

@@ -213,7 +213,10 @@ class RecordingSpec:
         # They would be replaced without a word: see `root_attributes`.
         clash = sorted(set(self.extra) & set(_own_attributes(self, None)))
         if clash:
-            raise UsageError(f"extra attributes {', '.join(clash)} are the format's own")
+            raise UsageError(
+                f"extra attributes {', '.join(clash)} are the format's own",
+                possible="attributes of other names",
+            )
         try:
             json.dumps([self.trigger, self.cameras, self.config, self.extra], allow_nan=False)
         except (TypeError, ValueError) as error:

@@ -104,7 +104,7 @@ class SolverContract:
         scale = float(np.abs(clean.video).max())
         np.testing.assert_allclose(bright.video, 2 * clean.video, atol=0.02 * scale)
 
-    def test_a_stop_ends_it_with_the_best_so_far_and_every_iteration_is_told(self) -> None:
+    def test_a_stop_ends_it_with_the_best_so_far_and_every_iteration_is_reported(self) -> None:
         segment, _ = blinking_segment()
         stop, reported = threading.Event(), []
 

@@ -45,7 +45,7 @@ def lens(taken: dict[str, Path]) -> Calibration:
     return known.with_step(alignment(open_exposure(taken["target"]), known))
 
 
-def test_a_fall_of_the_light_is_told_wherever_corrections_are(lens: Calibration) -> None:
+def test_a_fall_of_the_light_is_named_wherever_corrections_are(lens: Calibration) -> None:
     """`show`, the page, and the provenance of videos named everything but this."""
     assert "in the darkest corner" in known_facts(lens)[LENS]
     assert LENS in corrected(lens)
@@ -79,7 +79,7 @@ def test_a_check_with_the_same_flat_finds_no_change(taken: dict[str, Path], lens
 
 
 @pytest.mark.parametrize(("loss", "change"), [(0.1, 0.118), (0.0, 0.176)])
-def test_another_fall_of_the_light_is_told_from_gains(
+def test_another_fall_of_the_light_is_distinguished_from_gains(
     lens: Calibration, tmp_path: Path, loss: float, change: float
 ) -> None:
     """By a flat: half of the loss in a corner is at the middle of a side. Gains were said to have changed."""

@@ -87,7 +87,7 @@ def test_the_order_is_the_user_s(camera: HarvestersCamera) -> None:
     apply(camera, ("remote", "OffsetX", 0), ("remote", "Width", 64))
 
 
-def test_a_setting_that_a_later_one_undoes_is_told(camera: HarvestersCamera) -> None:
+def test_a_setting_that_a_later_one_undoes_is_refused(camera: HarvestersCamera) -> None:
     def settings() -> Iterator[Setting]:
         yield Setting("remote", "Width", 32)
         node = camera.features()["remote"].find("Width")

@@ -200,7 +200,7 @@ def test_a_reader_that_is_late_loses_frames_for_want_of_buffers(open_camera: Any
     assert take.losses[0][0] == 16 * HEIGHT, "sixteen buffers were announced, and filled"
 
 
-def test_a_device_that_is_gone_is_told_at_once_and_can_be_opened_again(
+def test_a_device_that_is_gone_is_reported_at_once_and_can_be_opened_again(
     bench: GentlBench, open_camera: Any
 ) -> None:
     memory, camera = memory_of(bench), open_camera()
@@ -251,7 +251,7 @@ def test_a_camera_in_use_is_listed_so_and_refused(bench: GentlBench, open_camera
         ({"cti": "/nowhere/x.cti"}, "no such file"),
     ],
 )
-def test_what_is_not_the_camera_that_was_asked_for_is_told_before_arming(
+def test_a_camera_other_than_the_requested_one_is_refused_before_arming(
     bench: GentlBench, changes: dict[str, Any], words: str
 ) -> None:
     given = {"serial": "SIM-64", "cti": str(bench.cti), **changes}

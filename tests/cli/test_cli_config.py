@@ -202,12 +202,12 @@ def test_a_place_that_serve_would_refuse_is_found_by_check(
         (b"stages = " + b"9" * 5000, "not TOML: it holds a number of thousands of digits\n  try: a file as"),
     ],
 )
-def test_what_is_no_toml_is_told_with_advice(cli: Cli, rig_file: Path, content: bytes, words: str) -> None:
+def test_what_is_no_toml_is_refused_with_advice(cli: Cli, rig_file: Path, content: bytes, words: str) -> None:
     rig_file.write_bytes(content)
     assert words in cli("config", "check", rig_file).err
 
 
-def test_a_link_to_nowhere_is_told_as_one(cli: Cli, rig_file: Path) -> None:
+def test_a_link_to_nowhere_is_named_as_one(cli: Cli, rig_file: Path) -> None:
     link = rig_file.with_name("link.toml")
     for target in ("absent.toml", link.name):
         link.unlink(missing_ok=True)

@@ -80,7 +80,7 @@ def recording(tmp_path: Path) -> Path:
     return write(tmp_path / "one.zarr")
 
 
-def test_why_lines_are_in_doubt_is_told(cli: Cli, recording: Path, tmp_path: Path) -> None:
+def test_info_says_why_lines_are_in_doubt(cli: Cli, recording: Path, tmp_path: Path) -> None:
     doubts = {"tag_mismatches": 2, "incomplete_a": 100, "unconfirmed_b": 7, "missed_trigger_b": 1}
     with RecordingWriter.create(tmp_path / "two.zarr", spec()) as writer:
         for arm in ARMS:
@@ -442,7 +442,9 @@ def test_foreign_text_is_escaped_before_it_reaches_a_terminal(cli: Cli, recordin
     assert answer.json["end_reason"] == HOSTILE
 
 
-def test_a_path_as_the_target_of_an_upload_is_told_its_url(cli: Cli, recording: Path, tmp_path: Path) -> None:
+def test_a_path_as_the_target_of_an_upload_is_refused_with_its_url(
+    cli: Cli, recording: Path, tmp_path: Path
+) -> None:
     """The advice was to install a package for the protocol ./copy.zarr."""
     answer = cli("upload", recording, str(tmp_path / "copy.zarr"))
     assert answer.code == 2

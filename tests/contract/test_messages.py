@@ -83,5 +83,5 @@ def test_every_error_has_a_verb() -> None:
         ("§ §", True),
     ],
 )
-def test_a_sentence_is_told_from_a_heading(text: str, sound: bool) -> None:
+def test_a_sentence_is_distinguished_from_a_heading(text: str, sound: bool) -> None:
     assert is_sound(text) is sound

@@ -240,7 +240,7 @@ def test_half_an_event_is_forgotten_with_its_connection(tmp_path: Path, kind: st
     server.join(60)
 
 
-def test_what_is_known_is_told_whole_however_late_the_daemon_is(tmp_path: Path) -> None:
+def test_the_history_of_events_arrives_whole_however_late_the_daemon_is(tmp_path: Path) -> None:
     news = News(id="a-1", time=datetime.now(UTC), kind="mark", text="drop", state=State.ARMED)
     whole = f"id: a-1\nevent: news\ndata: {news.model_dump_json()}\n\n: alive\n\n".encode()
     server = _breaking_off(tmp_path / "sock", [whole], late_s=0.5)
@@ -264,7 +264,7 @@ def test_a_refusal_that_comes_in_parts_is_understood(tmp_path: Path, kind: str) 
     server.join(60)
 
 
-def test_an_event_of_another_version_is_told_once() -> None:
+def test_an_event_of_another_version_is_refused_once() -> None:
     reader = core.EventReader()
     lines = ["event: news", "data: {}", ""]
     with pytest.raises(AcquireError, match="another version"):

@@ -181,7 +181,9 @@ def test_wait(daemon: Client, run: FakeRun) -> None:
         daemon.wait({State.RECORDING}, 0.2)
 
 
-def test_defect_in_the_daemon_is_told(daemon: Client, run: FakeRun, caplog: pytest.LogCaptureFixture) -> None:
+def test_a_defect_in_the_daemon_is_reported_and_logged(
+    daemon: Client, run: FakeRun, caplog: pytest.LogCaptureFixture
+) -> None:
     run.refuse["arm"] = ZeroDivisionError("oops")  # type: ignore[assignment]
     with pytest.raises(AcquireError, match=r"defect in the daemon.*oops"):
         daemon.arm()

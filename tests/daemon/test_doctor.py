@@ -57,7 +57,9 @@ def test_limits_are_judged_by_what_the_rig_asks_for(tmp_path: Path, monkeypatch:
     assert "LimitNOFILE" in found(None, "descriptors").todo
 
 
-def test_sessions_that_share_the_processors_are_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_sessions_that_share_the_processors_are_warned_of(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(doctor, "sessions_share", lambda: True)
     one = found(rig_config(tmp_path), "sessions")
     assert (one.level, "sched_autogroup_enabled=0" in one.todo) == ("warning", True)
@@ -86,7 +88,7 @@ def test_a_mount_with_a_space_in_its_name_is_found(monkeypatch: pytest.MonkeyPat
     assert doctor._file_system(Path("/mnt/lab")) == "ext4"
 
 
-def test_a_host_without_ipv6_is_told_that_of_its_page(
+def test_a_page_on_ipv6_is_warned_of_where_the_host_has_none(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The socket itself is refused there, which ended the whole examination."""

@@ -79,7 +79,7 @@ def test_a_client_that_was_away_hears_what_it_missed() -> None:
     assert log.after(log.last_id) == []
 
 
-def test_what_is_not_kept_any_more_is_told_as_missed() -> None:
+def test_news_that_are_not_kept_any_more_are_reported_as_missed() -> None:
     log = NewsLog(kept=2)
     log.add("mark", "first")
     seen = log.last_id
@@ -111,7 +111,7 @@ def test_listeners_are_woken_until_they_are_forgotten() -> None:
     assert len(woken) == 2
 
 
-def test_lost_lines_are_told_at_once_and_then_summed() -> None:
+def test_lost_lines_are_reported_at_once_and_then_summed() -> None:
     now = 100.0
     changes = Changes(lambda: now)
     assert changes.of(status()) == []
@@ -127,7 +127,7 @@ def test_lost_lines_are_told_at_once_and_then_summed() -> None:
     assert told["lines"] == 3
 
 
-def test_a_verdict_is_told_when_it_changes() -> None:
+def test_a_verdict_is_reported_when_it_changes() -> None:
     changes = Changes()
     assert changes.of(status(arm_status(verdict="unknown"))) == []
     (good,) = changes.of(status(arm_status(verdict="verified")))
@@ -137,7 +137,7 @@ def test_a_verdict_is_told_when_it_changes() -> None:
     assert changes.of(status(arm_status(verdict="wrong_code"))) == []
 
 
-def test_waiting_is_told_when_it_begins_and_ends() -> None:
+def test_waiting_is_reported_when_it_begins_and_ends() -> None:
     changes = Changes()
     assert changes.of(status()) == []
     assert [one["kind"] for one in changes.of(status(waiting="the disk, for 2 s"))] == ["waiting"]
@@ -145,7 +145,7 @@ def test_waiting_is_told_when_it_begins_and_ends() -> None:
     assert [one["text"] for one in changes.of(status())] == ["the wait is over"]
 
 
-def test_what_was_told_is_not_told_again_when_a_run_begins() -> None:
+def test_old_news_are_not_repeated_when_a_run_begins() -> None:
     changes = Changes()
     recovered = {"path": "/d/x.zarr", "state": "recovered", "text": "killed"}
     trouble = {"text": "oh", "times": 1, "last": "2026-01-01T00:00:00Z"}
@@ -155,7 +155,7 @@ def test_what_was_told_is_not_told_again_when_a_run_begins() -> None:
         assert changes.of(status(run_id=run_id, **facts)) == []
 
 
-def test_a_disk_that_fills_is_told_once() -> None:
+def test_a_disk_that_fills_is_reported_once() -> None:
     changes = Changes(lambda: 0.0)
     assert changes.of(status(disk=disk(1e6))) == []
     changes = Changes(lambda: 0.0)
@@ -164,7 +164,7 @@ def test_a_disk_that_fills_is_told_once() -> None:
     assert changes.of(status(disk=disk(90.0))) == []
 
 
-def test_what_nobody_foresaw_is_told_every_time_it_happens(tmp_path: Path) -> None:
+def test_an_unforeseen_error_is_reported_every_time_it_happens(tmp_path: Path) -> None:
     service = Service(rig_config(tmp_path), lambda _: FakeRun())
     for _ in range(2):
         service.troubles.note("thread x", ValueError("oh"))

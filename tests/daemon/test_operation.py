@@ -50,7 +50,7 @@ def until_written(path: Path, lines: int) -> list[dict[str, str]]:
     return [json.loads(line) for line in path.read_text().splitlines()]
 
 
-def test_a_command_is_told_faults_losses_and_the_disk_and_nothing_else(tmp_path: Path) -> None:
+def test_a_hook_receives_faults_losses_and_the_disk_and_nothing_else(tmp_path: Path) -> None:
     log, told = NewsLog(), tmp_path / "told"
     code = f"import sys; open({str(told)!r}, 'a').write(sys.stdin.read() + chr(10))"
     hooks = Hooks(HooksConfig(command=(sys.executable, "-c", code)), log, "rig")

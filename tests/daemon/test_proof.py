@@ -46,7 +46,7 @@ def make_proof(directory: Path, *, real: bool = True) -> Proof:
     return Proof(load_rig("rig-demo", {"recording.directory": str(directory), **drivers}))
 
 
-def test_enough_is_told_and_measured_once(measured: dict[str, Any], tmp_path: Path) -> None:
+def test_a_sufficient_rate_is_measured_once(measured: dict[str, Any], tmp_path: Path) -> None:
     prove = make_proof(tmp_path)
     for _ in range(3):
         found = prove(force=False)

@@ -93,7 +93,7 @@ def test_lost_has_one_truth() -> None:
     assert {cause: n for cause, n in status.lost.items() if n} == status.ledger.lost == {"undelivered": 35}
 
 
-def test_a_trigger_that_is_silent_is_told() -> None:
+def test_a_silent_trigger_is_reported() -> None:
     assert trigger_status(CALM) is None
     facts = {"clock_hz": 90_000_000, "uncertainty_ns": 900, "pulses": 7, "silent_s": 0.5}
     found = [trigger_status(replace(CALM, trigger=facts | {"silent_s": silent})) for silent in (0.5, 60.0)]

@@ -129,7 +129,7 @@ def test_acknowledged_lines_without_a_root_are_recovered(salvage: Salvage, tmp_p
     assert open_recording(path).lines == LINES
 
 
-def test_what_the_recorder_was_told_of_its_lines_and_did_not_write_is_listed(
+def test_marks_that_the_recorder_received_and_did_not_write_are_listed(
     salvage: Salvage, tmp_path: Path
 ) -> None:
     """A mark whose line was committed, and which was not, belongs to this recording and to no successor's."""
@@ -290,7 +290,7 @@ def test_a_journal_that_is_damaged_costs_a_line_in_the_log(
     assert str(journal) in caplog.text
 
 
-def test_a_recovery_that_is_killed_is_told(salvage: Salvage, tmp_path: Path) -> None:
+def test_a_recovery_that_is_killed_is_reported_as_failed(salvage: Salvage, tmp_path: Path) -> None:
     path = leave_open(tmp_path / "r.zarr")
     salvage.add([Orphan(path, "killed")])
     salvage.poll()

@@ -104,7 +104,9 @@ def test_second_signal_does_not_wait_for_lines(path: Path) -> None:
     assert live(path, run, script) == EXIT_INTERRUPTED
 
 
-def test_ready_is_told_once_requests_are_answered(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_readiness_is_reported_once_requests_are_answered(
+    path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     told: list[str] = []
     monkeypatch.setattr("acquire.daemon.server.notify", told.append)
     before: list[str] = []

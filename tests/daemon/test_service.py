@@ -194,7 +194,7 @@ def test_fault_tells_of_a_failing_end_too(tmp_path: Path, error: Exception, told
     assert bed.service.status().fault == f"first; then, while ending: {told}"
 
 
-def test_what_ended_the_recording_is_told_before_what_went_wrong_after_it(tmp_path: Path) -> None:
+def test_a_fault_names_what_ended_the_recording_before_what_went_wrong_after_it(tmp_path: Path) -> None:
     run = FakeRun(close=DeviceError("grabber b: the process did not end when told to"))
     bed = Bed(tmp_path, run, **{"recording.after": "idle"})
     bed.record()

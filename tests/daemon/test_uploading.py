@@ -166,7 +166,7 @@ def test_a_segment_is_listed_there_as_it_is_here(place: Place) -> None:
     look_until(uploads, lambda: set(states(uploads).values()) == {"copied"})
 
 
-def test_what_cannot_be_is_told_and_the_others_go_on(place: Place) -> None:
+def test_uploads_that_cannot_be_are_reported_and_the_others_go_on(place: Place) -> None:
     taken = place.write("taken.zarr")
     mirror(place.write("another.zarr", run_id="another"), f"file://{place.far}/taken.zarr")
     (place.here / "broken.zarr").mkdir()
@@ -251,7 +251,7 @@ def test_a_place_that_says_no_is_refused_unless_forced(place: Place) -> None:
     assert "/proc/nobody" in str(uploads.warning)
 
 
-def test_a_journal_that_cannot_be_read_is_told(place: Place, caplog: pytest.LogCaptureFixture) -> None:
+def test_a_journal_that_cannot_be_read_is_reported(place: Place, caplog: pytest.LogCaptureFixture) -> None:
     place.journal.write_text("[")
     assert place.daemon().statuses == []
     assert "does not say what is to be uploaded" in caplog.text

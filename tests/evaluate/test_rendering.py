@@ -94,7 +94,7 @@ def test_impossible_renderings_are_refused(tmp_path):
         render([one, panel(tmp_path, "b", 5, 1000, begin=10**9)], tmp_path / "m.gif", Look(), 5)
 
 
-def test_a_damaged_video_is_told(tmp_path):
+def test_a_damaged_video_is_refused_and_leaves_no_file(tmp_path):
     found = panel(tmp_path, "a", 6, 1000)
     for file in (tmp_path / "a.zarr" / "0" / "c").rglob("*"):
         if file.is_file():

@@ -188,7 +188,7 @@ def test_options_of_its_camera_are_checked(acquire: Run, tmp_path: Path) -> None
     assert "cameras.a.options.step = 0" in refused.stderr
 
 
-def test_mistakes_and_broken_ones_are_told_by_name(acquire: Run, tmp_path: Path) -> None:
+def test_misspelt_and_broken_effects_are_refused_by_name(acquire: Run, tmp_path: Path) -> None:
     (tmp_path / "bad.toml").write_text(SCENE.format(more='[[effects]]\nkind = "haze"').replace('er"', 'r"'))
     refused = acquire("simulate", "bad.toml", "--config", "rig.toml", "--lines", "9", "--out", "x.zarr")
     assert refused.returncode == 2

@@ -84,7 +84,7 @@ def test_mistakes_in_its_table_are_named_as_those_in_ours(install: Install, tmp_
     assert "effects.1.levl: unknown key; allowed here: kind, level" in str(caught.value)
 
 
-def test_an_unknown_effect_is_told_with_what_there_is_and_from_where(
+def test_an_unknown_effect_is_refused_with_those_there_are_and_their_origin(
     install: Install, tmp_path: Path
 ) -> None:
     install("lab-light", {"glow": "lab_light:Glow"}, GLOW)

@@ -176,7 +176,7 @@ def test_a_nursery_that_dies_is_replaced_and_its_workers_go_on(mortal: Own) -> N
     worker.end(deadline())
 
 
-def test_a_worker_that_was_not_born_yet_is_told() -> None:
+def test_the_end_of_a_worker_that_was_not_yet_forked_is_reported() -> None:
     one = Nursery()
     os.kill(one.pid, signal.SIGSTOP)
     child = one.fork("one", leave, 0)

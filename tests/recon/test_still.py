@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from acquire.evaluate.metrics import psnr
-from acquire.recon import reconstruct
+from acquire.recon import choose, reconstruct
 from acquire.recon.admm import Admm, AdmmParameters
 from acquire.recon.band import band_operator
 from acquire.recon.basis import TemporalBasis
@@ -52,6 +52,15 @@ def test_an_object_before_a_still_is_solved_as_a_change() -> None:
     truth = whole.truth(3, 1)
     assert psnr(result.video[result.trusted], truth) > db(still.video, whole, 3) + 1
     assert result.video.min() >= 0
+
+
+def test_a_change_is_tried_from_a_still_that_no_search_improves(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It was left out: boxes on a road with little light lost 1 dB, with two codes of three."""
+    monkeypatch.setattr(choose, "best_still", lambda still, trials, merge: still)
+    whole = record("traffic", 71, stages=16, lines=100, camera=Camera(1e3))
+    result = reconstruct(whole.segment, 3, 4, "fast", check=False, error=False)
+    assert any(each.get("change") for each in result.parameters["candidates"])
+    assert result.parameters["change"]
 
 
 def test_samples_with_large_residuals_get_less_weight() -> None:

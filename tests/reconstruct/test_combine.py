@@ -106,6 +106,14 @@ def test_a_plan_brings_different_voxels_to_one_grid(recording_path, tmp_path):
     assert np.ptp(video[frames], axis=0).max() < 1e-6
 
 
+@pytest.mark.parametrize(("temporal_merge", "longest"), [(1, 4 * 24), (24, 32 * 24)])
+def test_sub_segments_are_as_long_as_their_voxels_need(recording_path, temporal_merge, longest):
+    request = in_voxels(by_lines(open_recording(recording_path)), Voxels(2, temporal_merge))
+    lengths = [each.end - each.begin for each in request.stretches]
+    assert max(lengths) <= longest
+    assert len(lengths) == -(-sum(lengths) // longest), "as few as possible"
+
+
 def test_times_select_the_lines_they_need(recording_path):
     recording = open_recording(recording_path)
     request = in_voxels(by_time(recording, 1_000_000, 3_000_000), Voxels(2, 1))

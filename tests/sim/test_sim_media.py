@@ -61,7 +61,7 @@ def test_an_array_in_fortran_order_is_shown_as_any_other(tmp_path):
 
 
 @pytest.mark.parametrize("change", ["cut short", "written anew", "removed"])
-def test_an_array_that_changes_while_it_is_shown_is_told(tmp_path, change):
+def test_an_array_that_changes_while_it_is_shown_is_refused(tmp_path, change):
     """One that was mapped ended the process (SIGBUS) when it was cut short."""
     path = tmp_path / "v.npy"
     video = RNG.random((200, 64, 64)).astype(np.float32)

@@ -110,7 +110,7 @@ def check_growth(recording, path, seen):
 
 
 @pytest.mark.parametrize("file_limit", [40_000, 100_000, 270_000])
-def test_full_disk_is_told_and_nothing_false_is_acknowledged(tmp_path, file_limit):
+def test_a_full_disk_is_reported_and_nothing_false_is_acknowledged(tmp_path, file_limit):
     """The kernel refuses to let a file grow beyond the limit, in the midst of a chunk."""
     path = tmp_path / "r.zarr"
     with writer_process(path, 10_000, file_limit) as process:

@@ -93,7 +93,7 @@ def test_the_root_is_put_last_and_nothing_stays_here(place, monkeypatch, tmp_pat
     assert not list(Path(tmp_path).glob("acquire-*"))
 
 
-def test_a_store_that_does_not_answer_is_told_before_anything_is_solved(bucket):
+def test_a_store_that_does_not_answer_is_refused_before_anything_is_solved(bucket):
     with pytest.raises(PlaceError, match="nobucketofthisname"):
         check_new_place("s3://nobucketofthisname/x.zarr")
     with pytest.raises(UsageError, match="gopher"):

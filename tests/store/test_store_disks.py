@@ -323,7 +323,7 @@ def test_a_kill_while_the_disk_is_measured_leaves_nothing(tmp_path, monkeypatch,
     assert not list(tmp_path.iterdir())
 
 
-def test_a_disk_that_is_gone_while_measured_is_told(tmp_path):
+def test_a_disk_that_is_gone_while_measured_is_an_error(tmp_path):
     with pytest.raises(OSError, match=os.strerror(errno.ENOENT)):
         measure_disk(tmp_path / "gone")
 

@@ -60,7 +60,7 @@ def test_a_table_that_contradicts_the_recording_is_refused(changes: dict[str, An
         make_spec(**changes)
 
 
-def test_a_damaged_table_is_told_when_the_recording_is_cut(tmp_path: Path) -> None:
+def test_a_damaged_table_is_refused_when_the_recording_is_cut(tmp_path: Path) -> None:
     spec = make_spec(stages=4, substeps=2, pixels=26, layout="fibre", fibre=FIBRE)
     with RecordingWriter.create(tmp_path / "r.zarr", spec) as writer:
         fill(writer, 50)

@@ -126,7 +126,7 @@ def test_a_recording_is_sealed_without_one(tmp_path, disk, why):
     assert verify(recording.path).intact
 
 
-def test_one_that_is_not_what_the_lines_are_is_told(tmp_path):
+def test_verify_reports_an_overview_that_contradicts_the_lines(tmp_path):
     recording = record(tmp_path / "r.zarr", 300)
     array = zarr.open_group(recording.path, mode="r+")["overview/b"]
     array[1:3] += 1

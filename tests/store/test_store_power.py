@@ -251,7 +251,7 @@ def check_arms(path: Path, spec, rows: int) -> None:
 
 
 @pytest.mark.parametrize("tag_chunks", [1, 2])
-def test_power_cut_without_forcing_leaves_no_line_that_is_not_told(tmp_path, tag_chunks):
+def test_power_cut_without_forcing_loses_no_line_unreported(tmp_path, tag_chunks):
     """With ``fsync="seal"`` lines may be lost, but each is flagged and listed, and none is invented."""
     spec = make_spec(fsync="seal", codec="none", shard_chunks=2, tag_chunks=tag_chunks)
     disk = TracedDisk()

@@ -88,7 +88,7 @@ def test_any_file_system_will_do(path, tmp_path):
     assert verify(place).damage == verify(tmp_path / "far" / "run.zarr").damage == ()
 
 
-def test_what_is_damaged_far_away_is_told(path, place):
+def test_damage_in_a_remote_store_is_found_and_refused(path, place):
     write(path)
     mirror(path, place)
     target = RemoteSource(place)
@@ -332,7 +332,7 @@ def test_a_recording_is_not_copied_onto_itself(path, tmp_path):
     assert (path / "zarr.json").read_bytes() == before
 
 
-def test_a_writer_that_is_gone_is_told(path, tmp_path):
+def test_a_writer_that_is_gone_is_reported(path, tmp_path):
     with RecordingWriter.create(path, SPEC) as writer:
         fill(writer, 100)
         writer.commit()
@@ -356,7 +356,7 @@ def test_a_slow_store_has_time_unless_somebody_says_how_much(monkeypatch):
     ]
 
 
-def test_what_cannot_be_reached_is_told(bucket, path):
+def test_places_that_cannot_be_reached_are_refused(bucket, path):
     with pytest.raises(PlaceError, match="does not exist"):
         open_recording(f"memory://{uuid.uuid4()}/no.zarr")
     with pytest.raises(UsageError, match="gopher"):
@@ -371,7 +371,7 @@ def test_what_cannot_be_reached_is_told(bucket, path):
     assert b"acquire" in RemoteSource(bucket).read(PROOF)
 
 
-def test_errors_of_other_file_systems_are_told_with_the_address(tmp_path, monkeypatch):
+def test_errors_of_other_file_systems_are_reported_with_the_address(tmp_path, monkeypatch):
     """zipfile's, ftplib's and aiohttp's are no OSErrors."""
     file = tmp_path / "far.zip"
     place = f"zip://run.zarr::file://{file}"

@@ -91,7 +91,7 @@ def test_a_growing_recording_is_refreshed(tmp_path):
             assert (before.lines, seen.lines) == (lines - 32, lines)
 
 
-def test_a_trigger_that_began_anew_is_told(killed):
+def test_an_outage_in_which_the_trigger_began_anew_has_no_count_of_lines(killed):
     recover(killed)
     segment = open_recording(resume(killed, 0, 40)).attrs["segment"]
     assert segment["outage"]["lines"] is None

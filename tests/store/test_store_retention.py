@@ -40,7 +40,7 @@ def left(path):
     return [shard for shard in range(40) if shard_files(path, shard)]
 
 
-def test_lines_that_are_too_old_go_and_that_is_told(path):
+def test_lines_that_are_too_old_are_dropped_and_listed(path):
     with RecordingWriter.create(path, spec_of(AGE)) as writer:
         grow(writer, 10 * SHARD)
         recording = open_recording(path)
@@ -162,7 +162,7 @@ def always_looking(monkeypatch):
     monkeypatch.setattr("acquire.store.room.LOOK_S", 0.0)
 
 
-def test_a_disk_that_is_nearly_full_is_told_before_it_is(path, always_looking):
+def test_a_disk_is_reported_as_nearly_full_before_it_is_full(path, always_looking):
     disk = SmallDisk(path, 1_000_000)
     spec = spec_of(None, reserve_bytes=300_000)
     with RecordingWriter.create(path, spec, disk) as writer:
@@ -195,7 +195,7 @@ def test_with_retention_the_oldest_lines_make_room_instead(path, always_looking)
         assert disk.free_bytes(path) + 300_000 > 0
 
 
-def test_recover_deletes_what_was_only_told(path):
+def test_recover_deletes_files_that_were_only_listed_as_dropped(path):
     with RecordingWriter.create(path, spec_of(AGE)) as writer:
         grow(writer, 6 * SHARD)
     before = left(path)

@@ -484,7 +484,9 @@ def test_a_defect_that_ends_the_supervisor_costs_no_recording(tmp_path: Path) ->
     assert (recording.state, recording.lines) == ("sealed", seen.recorded_lines)
 
 
-def test_a_supervisor_that_its_trigger_holds_up_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_supervisor_that_its_trigger_holds_up_is_reported_as_waiting(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     bench, returns = make_bench(), threading.Event()
     with armed(bench) as capture:
         tags = bench.trigger.tags

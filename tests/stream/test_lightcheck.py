@@ -72,26 +72,26 @@ def test_light_that_follows_the_code_is_verified(scene: str) -> None:
 
 @pytest.mark.parametrize("scene", SCENES)
 @pytest.mark.parametrize("late", [1, -1, 3, -64, 1000])
-def test_a_shift_is_told_to_the_substep(scene: str, late: int) -> None:
+def test_a_shift_is_measured_to_the_substep(scene: str, late: int) -> None:
     for finding in verdicts(scene, late=late).values():
         assert (finding.verdict, finding.shift) == (Verdict.SHIFTED, -late)
 
 
 @pytest.mark.parametrize("scene", SCENES)
-def test_the_wrong_polarity_is_told(scene: str) -> None:
+def test_the_wrong_polarity_is_recognised(scene: str) -> None:
     for finding in verdicts(scene, inverted=True).values():
         assert (finding.verdict, finding.shift) == (Verdict.INVERTED, 0)
 
 
 @pytest.mark.parametrize("scene", SCENES)
-def test_another_code_is_told(scene: str) -> None:
+def test_another_code_is_recognised(scene: str) -> None:
     for finding in verdicts(scene, late=-(10**6)).values():
         assert finding.verdict is Verdict.WRONG_CODE
 
 
 @pytest.mark.parametrize("scene", SCENES)
 @pytest.mark.parametrize("slip", [1, -2])
-def test_an_arm_that_slipped_by_lines_is_told_from_the_other(scene: str, slip: int) -> None:
+def test_an_arm_that_slipped_by_lines_is_distinguished_from_the_other(scene: str, slip: int) -> None:
     lines, stages, substeps, white, code = recorded(scene)
     slipped = {"a": lines["a"][4:-4], "b": np.roll(lines["b"], slip, axis=0)[4:-4]}
     found = Judge(stages, substeps, code, white, {}).look(FIRST + 4, sights(slipped))
@@ -174,7 +174,7 @@ def test_faint_light_that_follows_the_code_is_not_dark(scene: str) -> None:
     assert {finding.verdict for finding in other.values()} == {Verdict.DARK}
 
 
-def test_dark_light_sources_are_told() -> None:
+def test_dark_light_sources_are_recognised() -> None:
     lines, stages, substeps, white, code = recorded("scene-usaf")
     rng = np.random.default_rng(3)
     judge = Judge(stages, substeps, code, white, {})

@@ -27,7 +27,7 @@ def test_the_line_after_a_pause_is_found_whatever_the_drift(ppm: float, away: in
     assert abs(clock.drift_ppb - ppm * 1000) < 50
 
 
-def test_what_is_not_certain_is_not_told() -> None:
+def test_a_time_without_a_certain_line_has_none() -> None:
     clock, period_ns = clock_after(50, 20.0)
     last = 256 * 49
     assert clock.line_at(round(10**15 + (last + 1000.5) * period_ns)) is None

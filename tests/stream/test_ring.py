@@ -410,7 +410,7 @@ def test_whoever_is_killed_the_others_go_on_and_a_successor_continues(players: P
     assert 0 <= players.ring.newest_line - players.counts["lines"] <= BIG.rows
 
 
-def test_an_observer_that_stops_is_lapped_and_told(players: Players) -> None:
+def test_an_observer_that_stops_is_lapped_and_counts_it(players: Players) -> None:
     for name in Players.targets:
         players.begin(name)
     players.until_more("seen", 50)

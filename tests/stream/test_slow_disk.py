@@ -184,7 +184,7 @@ def test_a_disk_that_fails_acknowledges_nothing_more(
 
 
 @given(st.floats(0.02, 0.98), st.integers(16, 1000))
-def test_a_ring_that_fills_in_small_steps_is_told_before_it_is_full(share: float, slots: int) -> None:
+def test_a_ring_that_fills_in_small_steps_is_reported_before_it_is_full(share: float, slots: int) -> None:
     """``share`` of what comes is taken: looks from 0.9 on come before it overflows."""
     growth = 1 / share - 1
     assume(growth < min(2, (1 - NEARLY_FULL) * slots - 1))

@@ -147,7 +147,7 @@ def test_a_recorder_that_is_killed_is_replaced_and_no_line_is_lost(run, tmp_path
     assert any(event.kind == "resumed" and "SIGKILL" in event.text for event in two.events)
 
 
-def test_what_a_recorder_did_not_live_to_write_down_is_told_to_its_successor(run, tmp_path):
+def test_marks_that_a_killed_recorder_did_not_write_are_passed_to_its_successor(run, tmp_path):
     run.capture.start(Begin(tmp_path / "r.zarr", run.spec()))
     until(lambda: run.capture.poll().committed_lines > 2000)
     recorder = run.capture.pids["recorder"]

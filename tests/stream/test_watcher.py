@@ -82,7 +82,7 @@ def beds() -> Iterator[list[Bed]]:
         bed.close()
 
 
-def test_what_follows_the_code_is_told_once(beds: list[Bed]) -> None:
+def test_lines_that_follow_the_code_are_reported_once(beds: list[Bed]) -> None:
     bed = Bed()
     beds.append(bed)
     bed.turn()
@@ -99,7 +99,7 @@ def test_what_follows_the_code_is_told_once(beds: list[Bed]) -> None:
     assert bed.counters["checked_line_b"] <= 1000 + bed.next
 
 
-def test_a_slip_in_mid_stream_is_told(beds: list[Bed]) -> None:
+def test_a_slip_in_mid_stream_is_reported(beds: list[Bed]) -> None:
     bed = Bed()
     beds.append(bed)
     bed.pass_by(18)
@@ -183,7 +183,7 @@ def test_lines_of_a_saturated_camera_prove_nothing_against_the_code(beds: list[B
     assert bed.post.said == []
 
 
-def test_a_crossing_is_told_with_its_line(beds: list[Bed]) -> None:
+def test_a_crossing_is_reported_with_its_line(beds: list[Bed]) -> None:
     bed = Bed(ThresholdPlan("b", 3000.0, 100.0, rising=True, average_lines=64))
     beds.append(bed)
     bed.pass_by(3)
@@ -194,7 +194,7 @@ def test_a_crossing_is_told_with_its_line(beds: list[Bed]) -> None:
     assert notes == [Note(1000 + 4 * ROWS + 64, "threshold", "arm b above 3000 DN")]
 
 
-def test_a_level_that_is_crossed_all_the_time_is_told_now_and_then(beds: list[Bed]) -> None:
+def test_a_level_that_is_crossed_all_the_time_is_reported_now_and_then(beds: list[Bed]) -> None:
     bed = Bed(ThresholdPlan("b", 3000.0, 100.0, rising=True, average_lines=1))
     beds.append(bed)
     bed.lines = {"a": bed.lines["a"], "b": bed.lines["b"].copy()}
@@ -205,7 +205,7 @@ def test_a_level_that_is_crossed_all_the_time_is_told_now_and_then(beds: list[Be
     assert notes[1].text == f"arm b above 3000 DN, {ROWS // 8 - 1} more times before"
 
 
-def test_a_light_that_comes_late_is_told_from_the_first_check_on(beds: list[Bed]) -> None:
+def test_a_light_that_comes_late_is_reported_from_the_first_check_on(beds: list[Bed]) -> None:
     bed = Bed(late=-2)
     beds.append(bed)
     bed.turn()

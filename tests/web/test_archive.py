@@ -44,7 +44,7 @@ LOAD = Load(8, "uint16", 1000.0)
 M, LINES, WHITE = 6, LINES_PER_ROW * PICTURE_ROWS, 4095
 
 
-def test_damaged_and_missing_lines_are_shown_as_lost_and_told(tmp_path: Path) -> None:
+def test_damaged_and_missing_lines_are_shown_as_lost_and_listed(tmp_path: Path) -> None:
     code, clock = PrbsCode(15, 77), ClockFit(90_000_000, 1_700_000_000_000_000_000, 100)
     camera = {"white_dn": WHITE, "black_level_dn": 0.0, "responsivity_dn": 1.0}
     spec = RecordingSpec(
@@ -162,7 +162,7 @@ def test_a_new_video_under_an_old_name_has_a_range_of_its_own(tmp_path: Path) ->
     assert ranges[1] > 7 * (ranges[0] or 0.0) > 6
 
 
-def test_a_damaged_video_is_told_as_damaged(tmp_path: Path) -> None:
+def test_a_damaged_video_is_reported_as_damaged(tmp_path: Path) -> None:
     """It was called a defect in the daemon."""
     path, frames = tmp_path / "film.zarr", np.random.default_rng(1).random((4, 6, 6), np.float32)
     write_video(path, frames, np.arange(4), pixel_size=1.0, frame_interval_ns=1.0, provenance={})

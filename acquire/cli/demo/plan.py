@@ -110,7 +110,8 @@ def check(plan: DemoPlan, rig: RigConfig) -> None:
         )
     if not out.absolute().parent.is_dir():
         raise UsageError(
-            f"the demo cannot be written to {out}: there is no directory {out.absolute().parent}"
+            f"the demo cannot be written to {out}: there is no directory {out.absolute().parent}",
+            hint="--out in a directory that exists",
         )
     for budget_s in (plan.budget_s, plan.twist_budget_s):
         if budget_s is not None and not budget_s > 0:
