@@ -146,6 +146,10 @@ class LearnedBasis:
         return _product(self.arrays, self.curves.T, self._within.analyze(video))
 
 
+LEAST_ENERGY = 1e-9
+"""Energy of a combination of harmonics, each of which has about 1, below which rounding determines it."""
+
+
 class CyclicBasis:
     """The constant and H harmonics of a period, a cosine and a sine of each: rows D (2H + 1, T).
 
@@ -157,11 +161,12 @@ class CyclicBasis:
     """
 
     def __init__(self, frames: int, harmonics: int, period_frames: float, arrays: Arrays = HOST) -> None:
+        refusal = UsageError(
+            f"{frames} frames do not show {harmonics} harmonics of a period of {period_frames:g} frames",
+            possible="fewer than half as many harmonics as frames of a period",
+        )
         if not (period_frames > 0 and harmonics >= 0 and 2 * harmonics < min(frames, period_frames)):
-            raise UsageError(
-                f"{frames} frames do not show {harmonics} harmonics of a period of {period_frames:g} frames",
-                possible="fewer than half as many harmonics as frames of a period",
-            )
+            raise refusal
         self.frames, self.harmonics, self.arrays = frames, harmonics, arrays
         self.period_frames = period_frames
         self.count = 2 * harmonics + 1
@@ -170,6 +175,9 @@ class CyclicBasis:
         self.held = np.arange(self.cosines)
         oblique = self._oblique(frames)
         energies, axes = np.linalg.eigh(oblique @ oblique.T)
+        # The sine of two frames a cycle is zero in all of them, and nearly so just above.
+        if energies[0] < LEAST_ENERGY:
+            raise refusal
         self._straighten = axes @ np.diag(energies**-0.5) @ axes.T
 
     def matrix(self, grid: int | None = None) -> NDArray[Any]:

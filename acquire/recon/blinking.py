@@ -37,7 +37,14 @@ from acquire.recon.cosines import (
 from acquire.recon.estimates import InBand, Refined
 from acquire.recon.patterns import PARAMETERS, ROUND, Refinement, find_patterns, has_clear_patterns
 from acquire.recon.pursuit import pursue, widened
-from acquire.recon.settling import BETTER_BESIDE_MOTION, better_than, early_error, has_time, settle
+from acquire.recon.settling import (
+    BETTER_BESIDE_MOTION,
+    SOON_EXPLAINED,
+    better_than,
+    early_error,
+    has_time,
+    settle,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
@@ -62,8 +69,6 @@ WIDER_SHARE = 0.5
 EXPLAINED_BY_NOISE, LEAST_MISSED = 1.15, 0.01
 """Held-out error relative to the noise above which a lamp may hide that the band mimics, and the error itself
 if the noise is unknown; the search for it takes a tenth of the time. One of 20 kHz leaves 1.25 and more."""
-SOON_EXPLAINED = 1.5
-"""Held-out error of patterns after their first rounds, relative to the noise, up to which nothing moves."""
 PLAIN_ITERATIONS = 90
 """Number of iterations for scenes without patterns: more of them fit what voxels cannot represent."""
 AT_REST = 0.1

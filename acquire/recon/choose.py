@@ -134,18 +134,18 @@ def _choose(bench: Workbench, volume: Trial, trials: int) -> Estimate:
     at_a_glance, clear = bench.held_out.relative(errors), has_clear_patterns(cosines)
     tried = _Tried(volume, plain)
     # These are tried even where cosines are ahead: a scene that flickers gains 6.6 to 15 dB by this, a flame
-    # up to 3.5. Evident lamps need the time for themselves.
+    # up to 3.5, and what turns by a cycle. Evident lamps need the time for themselves.
     lamps = isinstance(cosines.basis, LearnedBasis) and tried.best.error > HOPELESS * at_a_glance
     if not (clear or lamps):
         tried.smooth = bench.probe(bench.fitting(SMOOTH), min(at_a_glance, tried.best.error))
         # The first cosine is constant, so that this is the video's mean over time.
         picture = (cosines.basis.matrix()[0, 0] * host(cosines.solver.theta[0, ...])).clip(0)
         tried.bright = bench.brighten(picture, cosines.basis.cosines, min(at_a_glance, tried.best.error))
-        period = find_period(cosines.solver.theta, cosines.basis)
-        if period is not None and not clock.spent(SEARCH_SHARE):
-            rival = min(at_a_glance, tried.best.error)
-            cycle = bench.repeat(period, rival)
-            tried.cycle = cycle if cycle.error < REPEATS * rival else None
+    period = None if clear else find_period(cosines.solver.theta, cosines.basis)
+    if period is not None and not clock.spent(SEARCH_SHARE):
+        rival = min(at_a_glance, tried.best.error)
+        cycle = bench.repeat(period, rival)
+        tried.cycle = cycle if cycle.error < REPEATS * rival else None
     ahead, refined = at_a_glance <= OUTDONE * tried.best.error, None
     if ahead:
         complete_look(given, cosines)

@@ -54,6 +54,9 @@ still be left out later; one too few is never found."""
 EARLY_ROUNDS = 2
 """Number of rounds before the first trial, in which both sides are refined for as many: what is superfluous
 mostly shows. The held-out error still rises and falls by a fifth."""
+SOON_EXPLAINED = 1.5
+"""Held-out error of patterns after their first rounds, relative to the noise, up to which they explain the
+lines: nothing moves beside them, and what is superfluous shows."""
 TRIAL_AFTER, TRIAL_ROUNDS = 8, 5
 """Number of rounds before the second trial if no noise is fitted, and those of the fewer patterns until they
 must predict better: first they have to take up the light of the others."""
@@ -168,16 +171,19 @@ class _Course:
 def _without_superfluous(given: Given, refinement: Refinement) -> Refinement:
     """The refinement without superfluous patterns, and without doubtful ones if a trial does as well.
 
-    Both sides of the trial are refined for as many rounds.
+    Both sides of the trial are refined for as many rounds. What patterns do that do not yet explain the lines
+    is decided by trials alone: beside all that is left, little shows the lack of a lamp.
     """
-    refinement = _restricted(refinement, SUPERFLUOUS)
-    fewer, clock = _restricted(refinement), given.clock
+    clock, tolerated = given.clock, 1.0
+    if given.problem.prediction_error(refinement.predict()) <= SOON_EXPLAINED * given.noise:
+        refinement, tolerated = _restricted(refinement, SUPERFLUOUS), SUPERFLUOUS
+    fewer = _restricted(refinement)
     if fewer is refinement or clock.iterations < LONG or not clock.affords(LONG * clock.mean_s):
         return fewer
     early_error(given, fewer)
     early_error(given, refinement)
     # Neither has anything left to explain if both meet the noise. A NaN, without held-out samples, stays one.
-    most = SUPERFLUOUS * max(refinement.excess(), 0.0)
+    most = tolerated * max(refinement.excess(), 0.0)
     return fewer if fewer.excess() <= most else refinement
 
 

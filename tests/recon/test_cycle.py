@@ -7,7 +7,7 @@ from functools import cache
 import array_api_strict
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from acquire.errors import UsageError
@@ -41,11 +41,13 @@ def quality_db(found: Reconstruction, scene: str, seed: int) -> float:
 
 @settings(max_examples=40, deadline=None)
 @given(st.integers(20, 200), st.integers(0, 6), st.floats(1.5, 9))
+@example(90, 5, 9 * (1 - 2e-16))  # the sine of two frames a cycle is zero
+@example(90, 5, 9 * (1 - 1e-3))
 def test_the_harmonics_are_orthonormal_and_hold_what_repeats(
     frames: int, harmonics: int, cycles: float
 ) -> None:
     period = frames / cycles
-    if 2 * harmonics >= min(frames, period):
+    if 2 * harmonics >= min(frames, period) * (1 - 1e-6):
         with pytest.raises(UsageError, match="harmonics"):
             CyclicBasis(frames, harmonics, period)
         return
