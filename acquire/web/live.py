@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING
 from acquire.errors import AcquireError
 from acquire.stream.peek import Peek
 from acquire.stream.ring import RingShape
+from acquire.text import cause_in_words
 from acquire.web.decimate import Decimator, Scale
 from acquire.web.frames import rows_message
 from acquire.web.places import shape_of
@@ -30,6 +31,8 @@ RECORDING_TURN_S = 0.1
 """The same during a recording, which takes precedence. A turn costs more than the pixels in it: since the one
 before, the lines have displaced everything else from the processors' caches."""
 KEPT_S = 2.0
+RETRY_S = 1.0
+"""Time between two tries to read rings that could not be read."""
 MOST_BLOCKS = 4096
 """Largest number of blocks read per turn; the rest waits for the next."""
 
@@ -101,9 +104,18 @@ class Live:
                 # It is tried again every second, and logged once.
                 if str(error) != self.error:
                     log.warning("live picture: %s", error)
-                self.error = str(error)
-                self._changed.wait(1.0)
-                self._changed.clear()
+                self._fail(str(error))
+            # The thread is the only one that reads the rings: without it, pages would show nothing, for ever.
+            except Exception as error:
+                if (said := cause_in_words(error)) != self.error:
+                    log.exception("live picture")
+                self._fail(said)
+
+    def _fail(self, why: str) -> None:
+        """Say why there is no picture, and wait before the next try."""
+        self.error = why
+        self._changed.wait(RETRY_S)
+        self._changed.clear()
 
     def _read(self, rings: Rings, setup: Setup) -> None:
         """Read rings until others are wanted, or none. Raises DeviceError if they cannot be mapped."""

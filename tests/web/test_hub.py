@@ -9,6 +9,8 @@ import time
 from collections.abc import Callable
 from datetime import UTC, datetime, timedelta, tzinfo
 from pathlib import Path
+from threading import Semaphore
+from types import SimpleNamespace
 
 import pytest
 from fake_run import FakeRun, rig_config
@@ -18,6 +20,7 @@ from acquire.client import AsyncClient
 from acquire.daemon import service as service_module
 from acquire.daemon.endpoint import Endpoint
 from acquire.daemon.service import Service
+from acquire.web import live as live_module
 from acquire.web.frames import HEAD
 from acquire.web.hub import Hub
 from acquire.web.live import RECORDING_TURN_S, TURN_S, Live
@@ -53,6 +56,30 @@ def test_pages_get_the_same_message_and_fewer_pictures_during_a_recording(tmp_pa
 
     with contextlib.closing(Endpoint(socket)) as endpoint, api(service, endpoint):
         asyncio.run(follow())
+
+
+def test_the_live_picture_is_tried_again_after_a_defect(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Its thread ended, and pages showed nothing until the server was started again."""
+    monkeypatch.setattr(live_module, "RETRY_S", 0.01)
+    tried = Semaphore(0)
+
+    class Defective(Live):
+        def _read(self, *_: object) -> None:
+            tried.release()
+            raise ValueError("what no test has seen")
+
+    live, anything = Defective(lambda: None), SimpleNamespace(arms={"a": None})
+    live.begin()
+    try:
+        live.show(anything, anything)  # type: ignore[arg-type]
+        live.watch()
+        assert all(tried.acquire(timeout=60) for _ in range(3))
+        assert live.error == "what no test has seen"
+        assert [record.message for record in caplog.records] == ["live picture"], "once, not at every try"
+    finally:
+        live.close()
 
 
 def test_how_long_a_state_lasts_does_not_follow_a_clock_that_is_set(
