@@ -81,7 +81,7 @@ def test_impossible_start_is_refused_before_it_is_sent(daemon: Client) -> None:
 
 
 def test_malformed_request_names_the_key(path: Path, daemon: Client) -> None:
-    with httpx.Client(transport=httpx.HTTPTransport(uds=str(path)), base_url="http://x") as raw:
+    with httpx.Client(transport=httpx.HTTPTransport(uds=str(path)), base_url="http://x", timeout=60) as raw:
         answer = raw.post("/start", json={"line": 5})
         assert answer.status_code == 422
         message = ErrorMessage.model_validate_json(answer.content)
@@ -102,7 +102,7 @@ def test_malformed_request_names_the_key(path: Path, daemon: Client) -> None:
 def test_requests_that_no_route_takes_are_answered_alike(
     path: Path, daemon: Client, method: str, url: str, code: int
 ) -> None:
-    with httpx.Client(transport=httpx.HTTPTransport(uds=str(path)), base_url="http://x") as raw:
+    with httpx.Client(transport=httpx.HTTPTransport(uds=str(path)), base_url="http://x", timeout=60) as raw:
         answer = raw.request(method, url, content=b"\xff", headers={"content-type": "application/json"})
     assert answer.status_code == code
     message = ErrorMessage.model_validate_json(answer.content)
@@ -135,7 +135,7 @@ def test_long_requests_are_not_read(path: Path, daemon: Client, run: FakeRun) ->
             yield b" " * 1000
 
     daemon.arm()
-    with httpx.Client(transport=httpx.HTTPTransport(uds=str(path)), base_url="http://x") as raw:
+    with httpx.Client(transport=httpx.HTTPTransport(uds=str(path)), base_url="http://x", timeout=60) as raw:
         for content in (b" " * 70_000, body()):
             answer = raw.post("/start", content=content, headers={"content-type": "application/json"})
             assert answer.status_code == 413
@@ -297,7 +297,7 @@ def test_unknown_error_of_another_version() -> None:
 
 
 def raw_client(path: Path) -> httpx.Client:
-    return httpx.Client(transport=httpx.HTTPTransport(uds=str(path)), base_url="http://x")
+    return httpx.Client(transport=httpx.HTTPTransport(uds=str(path)), base_url="http://x", timeout=60)
 
 
 LONG = "x" * 60_000

@@ -100,7 +100,9 @@ def test_odd_entries_are_reported_and_do_not_keep_the_daemon_from_ending(
     try:
         with (
             daemon.client() as client,
-            httpx.Client(transport=httpx.HTTPTransport(uds=str(daemon.socket)), base_url="http://x") as raw,
+            httpx.Client(
+                transport=httpx.HTTPTransport(uds=str(daemon.socket)), base_url="http://x", timeout=60
+            ) as raw,
         ):
             for _ in range(20):
                 answer = raw.get("/status")

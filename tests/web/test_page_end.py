@@ -40,11 +40,11 @@ def test_pending_requests_do_not_fail_when_the_page_ends(tmp_path: Path, reads: 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
 def test_a_page_that_is_told_to_end_has_succeeded(tmp_path: Path, number: int) -> None:
     """systemd, and any script, took the death by a signal for a failure."""
-    server = PageServer(tmp_path / "c.sock", tmp_path)
-    assert httpx.get(server.address).status_code == 200  # until then the signals are not its own
-    server.process.send_signal(number)
-    assert server.process.wait(60) == 0
-    server.close()
+    with contextlib.closing(PageServer(tmp_path / "c.sock", tmp_path)) as server:
+        # Until then the signals are not its own. It yields to other programs: five seconds were too few.
+        assert httpx.get(server.address, timeout=60).status_code == 200
+        server.process.send_signal(number)
+        assert server.process.wait(60) == 0
 
 
 def test_the_link_leads_to_the_page_that_the_daemon_has_started(tmp_path: Path) -> None:
