@@ -171,8 +171,8 @@ class _Course:
 def _without_superfluous(given: Given, refinement: Refinement) -> Refinement:
     """The refinement without superfluous patterns, and without doubtful ones if a trial does as well.
 
-    Both sides of the trial are refined for as many rounds. What patterns do that do not yet explain the lines
-    is decided by trials alone: beside all that is left, little shows the lack of a lamp.
+    Both sides of the trial are refined for as many rounds. Until the lines are nearly explained only a trial
+    decides: beside all that is left of them, the lack of a lamp hardly shows.
     """
     clock, tolerated = given.clock, 1.0
     if given.problem.prediction_error(refinement.predict()) <= SOON_EXPLAINED * given.noise:
