@@ -228,7 +228,8 @@ class _Run:
             video_error = estimate_error(self.given, estimate, video=video, quality=quality, cut=cut)
         warnings = judge(segment, problem, quality, trusted)
         if period_frames := facts.get("period_frames"):
-            warnings = (*warnings, describe_cycle(period_frames, segment.substep_ns * T_m))
+            repeats = describe_cycle(period_frames, facts["speed_changes"], segment.substep_ns * T_m)
+            warnings = (*warnings, repeats)
         return Reconstruction(
             video=video,
             time_ns=segment.frame_time_ns(T_m),

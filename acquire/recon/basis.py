@@ -12,12 +12,15 @@ import math
 from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
+from numpy.polynomial import Legendre
 from scipy.fft import dct, idct
 
 from acquire.arrays import HOST
 from acquire.errors import UsageError
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from numpy.typing import NDArray
 
     from acquire.arrays import Array, Arrays
@@ -146,6 +149,23 @@ class LearnedBasis:
         return _product(self.arrays, self.curves.T, self._within.analyze(video))
 
 
+def share_passed(points: int, speed_changes: Sequence[float] = ()) -> NDArray[np.float64]:
+    """The share of the span's cycles that has passed at equidistant instants, less its mean over the span.
+
+    It grows by 1 whatever the changes of speed, because P₁, P₂, … have a mean of 0: by −½ … ½ without any.
+    """
+    way = Legendre([1.0, *speed_changes]).integ() / 2
+    way.coef[0] = 0.0  # the constant, which would turn all phases alike
+    share: NDArray[np.float64] = way((2 * np.arange(points) + 1) / points - 1)
+    return share
+
+
+def speed_range(speed_changes: Sequence[float]) -> tuple[float, float]:
+    """The slowest and the fastest speed in the span, relative to the mean."""
+    speed = Legendre([1.0, *speed_changes])(np.linspace(-1, 1, 65))
+    return float(speed.min()), float(speed.max())
+
+
 LEAST_ENERGY = 1e-9
 """Energy of a combination of harmonics, each of which has about 1, below which rounding determines it."""
 
@@ -153,25 +173,39 @@ LEAST_ENERGY = 1e-9
 class CyclicBasis:
     """The constant and H harmonics of a period, a cosine and a sine of each: rows D (2H + 1, T).
 
-    Phases count from the middle of the span, so that a slightly longer period moves both ends alike. In a
+    ``speed_changes`` s₁, s₂, … are those of a speed that changes: 1 + Σ sᵢ·Pᵢ(x) of its mean, with Legendre's
+    polynomials Pᵢ over the span, x = −1 … 1. ``period_frames`` is then the mean period.
+
+    The mean phase is 0, so that a slightly longer period moves both ends alike. In a
     span that is no whole number of periods the harmonics are slightly oblique: D is the orthonormal set that
     is closest to them (Löwdin, J. Chem. Phys. 18, 365 (1950)).
 
-    Raises UsageError if the period is not positive, or if the frames are too few for its harmonics.
+    Raises UsageError if the period or a speed is not positive, or if there are too few frames for the
+    harmonics.
     """
 
-    def __init__(self, frames: int, harmonics: int, period_frames: float, arrays: Arrays = HOST) -> None:
+    def __init__(
+        self,
+        frames: int,
+        harmonics: int,
+        period_frames: float,
+        arrays: Arrays = HOST,
+        speed_changes: Sequence[float] = (),
+    ) -> None:
         refusal = UsageError(
             f"{frames} frames do not show {harmonics} harmonics of a period of {period_frames:g} frames",
             possible="fewer than half as many harmonics as frames of a period",
         )
-        if not (period_frames > 0 and harmonics >= 0 and 2 * harmonics < min(frames, period_frames)):
+        slowest, fastest = speed_range(speed_changes)
+        if not (period_frames > 0 and slowest > 0 and harmonics >= 0):
+            raise refusal
+        if not 2 * harmonics < min(frames, period_frames / fastest):
             raise refusal
         self.frames, self.harmonics, self.arrays = frames, harmonics, arrays
-        self.period_frames = period_frames
+        self.period_frames, self.speed_changes = period_frames, tuple(speed_changes)
         self.count = 2 * harmonics + 1
         # Cosine k of the span is k/2 cycles in it.
-        self.cosines = min(frames, math.ceil(2 * harmonics * frames / period_frames) + 1)
+        self.cosines = min(frames, math.ceil(2 * harmonics * fastest * frames / period_frames) + 1)
         self.held = np.arange(self.cosines)
         oblique = self._oblique(frames)
         energies, axes = np.linalg.eigh(oblique @ oblique.T)
@@ -189,7 +223,7 @@ class CyclicBasis:
 
     def _oblique(self, points: int) -> NDArray[np.float64]:
         """The harmonics at this many instants, scaled to a norm of about 1."""
-        cycles = self.frames / self.period_frames * ((np.arange(points) + 0.5) / points - 0.5)
+        cycles = self.frames / self.period_frames * share_passed(points, self.speed_changes)
         angle = 2 * np.pi * np.arange(1, self.harmonics + 1)[:, None] * cycles
         pairs = np.stack([np.cos(angle), np.sin(angle)], axis=1).reshape(-1, points)
         rows: NDArray[np.float64] = np.concatenate(

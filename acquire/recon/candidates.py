@@ -53,6 +53,7 @@ class Candidate:
     fine: bool = False
     robust: bool = False
     period_frames: float = 0.0
+    speed_changes: tuple[float, ...] = ()
 
     def denoiser(self) -> Denoiser:
         """The denoiser of this prior."""
@@ -65,7 +66,7 @@ class Candidate:
     def basis(self, frames: int, arrays: Arrays) -> TemporalBasis | CyclicBasis:
         """The temporal basis of its coefficients."""
         if self.prior == "cycle":
-            return CyclicBasis(frames, self.coefficients // 2, self.period_frames, arrays)
+            return CyclicBasis(frames, self.coefficients // 2, self.period_frames, arrays, self.speed_changes)
         return TemporalBasis(frames, self.coefficients, arrays)
 
     def is_stronger_than(self, other: Candidate) -> bool:
@@ -85,7 +86,8 @@ class Candidate:
     def with_coefficients(self, step: int, frames: int) -> Candidate | None:
         """The candidate with the next number of coefficients in either direction; None beyond the limits."""
         if self.prior == "cycle":
-            counts = [2 * min(each, most_harmonics(self.period_frames)) + 1 for each in HARMONICS]
+            most = most_harmonics(self.period_frames, self.speed_changes)
+            counts = [2 * min(each, most) + 1 for each in HARMONICS]
         else:
             counts = [min(each, frames) for each in COSINES]
         further = [each for each in counts if (each - self.coefficients) * step > 0]

@@ -141,10 +141,10 @@ def _choose(bench: Workbench, volume: Trial, trials: int) -> Estimate:
         # The first cosine is constant, so that this is the video's mean over time.
         picture = (cosines.basis.matrix()[0, 0] * host(cosines.solver.theta[0, ...])).clip(0)
         tried.bright = bench.brighten(picture, cosines.basis.cosines, min(at_a_glance, tried.best.error))
-    period = None if clear else find_period(cosines.solver.theta, cosines.basis)
-    if period is not None and not clock.spent(SEARCH_SHARE):
+    repeats = None if clear else find_period(cosines.solver.theta, cosines.basis)
+    if repeats is not None and not clock.spent(SEARCH_SHARE):
         rival = min(at_a_glance, tried.best.error)
-        cycle = bench.repeat(period, rival)
+        cycle = bench.repeat(*repeats, rival)
         tried.cycle = cycle if cycle.error < REPEATS * rival else None
     ahead, refined = at_a_glance <= OUTDONE * tried.best.error, None
     if ahead:
@@ -222,7 +222,7 @@ def _search(bench: Workbench, tried: _Tried, trials: int, rival: float) -> Trial
         if volume.candidate.brightness:
             volume = volume.bench.follow_brightness(volume)
         if volume.candidate.period_frames:
-            volume = volume.bench.follow_period(volume)
+            volume = volume.bench.follow_speed(volume)
     if smooth.error < FAR * min(volume.error, rival):
         smooth = bench.climb(smooth, trials)
     # The gain has to be beyond chance, which is worth 5 dB where something flashes. This is not required of

@@ -4,19 +4,22 @@ Solved as one cycle, a video has a few harmonics of the period for unknowns inst
 the fastest, and other lines see each phase in every cycle. The period is looked for in a first look at the
 scene, as a comb in its spectrum, and then fitted to the lines: their derivative with respect to the number of
 cycles shows which change of it explains most of what is left (Gauss–Newton).
+
+Motors do not turn evenly. The comb is looked for at speeds that rise or fall over the span, too, and the fit
+finds the speed as a polynomial of time where this predicts better.
 """
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from acquire.arrays import host
-from acquire.recon.basis import CyclicBasis
+from acquire.recon.basis import CyclicBasis, share_passed, speed_range
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Sequence
 
     from numpy.typing import NDArray
 
@@ -40,75 +43,120 @@ ROUNDING = 1e-10
 """Energy of a change, relative to that of the mean, below which it may be rounding."""
 NUDGE, FARTHEST = 0.01, 0.1
 """Difference in cycles for the derivative of the lines, and the largest change of one fit."""
+TRIED_CHANGES = tuple(round(0.04 * each, 2) for each in range(-10, 11))
+"""Rises of the speed from its mean to the end of the span at which a comb is looked for. Ten cycles differ by
+0.2 of one between two of them, from where the fit goes on."""
+CERTAIN = 1e-6
+"""Energy in the lines, relative to that of the best determined combination of speeds, below which one is left
+alone."""
+SLOWEST, NOTEWORTHY = 0.2, 1.01
+"""Lowest speed, relative to the mean, that a fit may reach; least ratio of speeds that a sentence names."""
+NEGLIGIBLE = 1e-3
+"""Largest share of the change in each course in time that combs leave out: they take a fifth of the time."""
 
 
-def most_harmonics(period_frames: float) -> int:
-    """The largest number of harmonics of a period that its frames show."""
-    return int(SHARE_OF_NYQUIST * period_frames / 2)
+def most_harmonics(period_frames: float, speed_changes: Sequence[float] = ()) -> int:
+    """The largest number of harmonics of a mean period that its frames show while it is shortest."""
+    return int(SHARE_OF_NYQUIST * period_frames / speed_range(speed_changes)[1] / 2)
 
 
-def find_period(theta: Array, basis: Basis) -> float | None:
-    """The period in frames of a video of coefficients θ (K, n′, n′); None if nothing repeats."""
+def find_period(theta: Array, basis: Basis) -> tuple[float, tuple[float, ...]] | None:
+    """The mean period in frames and the changes of speed of a video of coefficients θ (K, n′, n′).
+
+    Returns None if nothing repeats.
+    """
     last = (basis.cosines - 1) / 2  # cosine k of the span is k/2 cycles in it
     tried = np.arange(round(FEWEST_CYCLES / STEP), int(last / FEWEST_HARMONICS / STEP))
     flat = host(theta).reshape(basis.count, -1).astype(np.float64)
     # The first cosine is constant, and no part of the change.
-    gram = flat[1:] @ flat[1:].T
-    change = float(np.trace(gram))
+    energies, axes = np.linalg.eigh(flat[1:] @ flat[1:].T)
+    change = float(energies.sum())
     if len(tried) < 3 or not change > ROUNDING * np.square(flat[0]).sum():
         return None
-    # This is the energy of the change at numbers of cycles in the span, on a grid of instants.
-    rows, cycles = basis.matrix(2 * basis.cosines)[1:].astype(np.float64), np.arange(0, last + STEP, STEP)
-    instants, energy = rows.shape[1], np.zeros(len(cycles))
-    angle = 2 * np.pi * cycles[:, None] * ((np.arange(instants) + 0.5) / instants - 0.5)
-    for wave in (np.cos(angle), np.sin(angle)):
-        # A wave's mean square is ½.
-        part = wave @ rows.T * (2 / instants) ** 0.5
-        energy += (part @ gram * part).sum(1)
-    harmonics = np.minimum(last // (tried * STEP), MOST_HARMONICS).astype(int)
-    held = np.zeros(len(tried))
-    for harmonic in range(1, MOST_HARMONICS + 1):
-        within = harmonics >= harmonic
-        held[within] += energy[tried[within] * harmonic]
-    chance = 2 * harmonics / (basis.count - 1)
-    comb = (held / change - chance) / np.maximum(1 - chance, STEP)
-    peaks = 1 + np.flatnonzero((comb[1:-1] >= comb[:-2]) & (comb[1:-1] > comb[2:]))
-    good = peaks[comb[peaks] > max(COMB, AS_GOOD * comb[peaks].max(initial=0))]
+    most = energies > NEGLIGIBLE * change
+    # These are the courses in which the video changes, at instants that are enough for its cosines.
+    courses = basis.matrix(2 * basis.cosines)[1:].T @ (axes[:, most] * energies[most] ** 0.5)
+    combs = np.stack([_comb(courses, tried, last, rise) / change for rise in TRIED_CHANGES])
+    chance = 2 * np.minimum(last // (tried * STEP), MOST_HARMONICS) / (basis.count - 1)
+    combs = (combs - chance) / np.maximum(1 - chance, STEP)
+    best = combs.max(0)
+    peaks = 1 + np.flatnonzero((best[1:-1] >= best[:-2]) & (best[1:-1] > best[2:]))
+    good = peaks[best[peaks] > max(COMB, AS_GOOD * best[peaks].max(initial=0))]
     if not len(good):
         return None
     near = np.flatnonzero(np.abs(tried - tried[good[-1]]) * STEP <= LOBE)
-    return basis.frames / (STEP * float(tried[near[comb[near].argmax()]]))
+    which, cycles = np.unravel_index(combs[:, near].argmax(), (len(combs), len(near)))
+    period, rise = basis.frames / (STEP * float(tried[near[cycles]])), TRIED_CHANGES[which]
+    return period, (rise,) if rise else ()
 
 
-def better_period(
+def _comb(courses: NDArray[Any], tried: NDArray[np.int64], last: float, rise: float) -> NDArray[np.float64]:
+    """Energy that the harmonics of each number of cycles hold of ``courses`` (instants, r).
+
+    ``tried``: the numbers of cycles in units of `STEP`; ``last``: that of the fastest harmonic.
+    """
+    # float32 takes a third of the time here.
+    passed = share_passed(len(courses), (rise,)).astype(np.float32)
+    angle = (2 * np.pi * STEP * np.arange(int(last / STEP) + 2, dtype=np.float32))[:, None] * passed
+    courses, energy = courses.astype(np.float32), np.zeros(len(angle))
+    for wave in (np.cos(angle), np.sin(angle)):
+        # A wave's mean square is ½.
+        energy += 2 / len(courses) * np.square(wave @ courses).sum(1)
+    harmonics, held = np.minimum(last // (tried * STEP), MOST_HARMONICS), np.zeros(len(tried))
+    for harmonic in range(1, MOST_HARMONICS + 1):
+        within = harmonics >= harmonic
+        held[within] += energy[tried[within] * harmonic]
+    return held
+
+
+def better_speed(
     problem: Problem,
     theta: Array,
     basis: CyclicBasis,
     operator: Callable[[CyclicBasis], Operator],
     stride: float,
-) -> float:
-    """The period in frames with which the same cycle θ (2H + 1, n′, n′) explains most of the samples.
+    order: int,
+) -> tuple[float, tuple[float, ...]]:
+    """The mean period and the changes of speed with which the same cycle θ explains most of the samples.
 
-    ``operator`` makes that of a basis. The number of cycles changes by ``stride`` times what the fit says.
+    ``operator`` makes that of a basis. The speed gets ``order`` changes, unless it has as many already, and
+    moves by ``stride`` times what the fit says.
     """
-    cycles = basis.frames / basis.period_frames
+    missing = (0.0,) * (order - len(basis.speed_changes))
+    # In cycles of the span, the mean and the changes.
+    speeds = basis.frames / basis.period_frames * np.array([1.0, *basis.speed_changes, *missing])
+    # The integral of Pₙ, which is the phase, is (Pₙ₊₁ − Pₙ₋₁)/(2n + 1).
+    unit = 2.0 * np.arange(len(speeds)) + 1
 
-    def lines(number: float) -> NDArray[np.float64]:
-        other = CyclicBasis(basis.frames, basis.harmonics, basis.frames / number, basis.arrays)
-        return host(problem.masked(operator(other)).forward(theta)).astype(np.float64)
+    def lines(speeds: NDArray[np.float64]) -> NDArray[np.float64]:
+        other = CyclicBasis(
+            basis.frames, basis.harmonics, basis.frames / speeds[0], basis.arrays, speeds[1:] / speeds[0]
+        )
+        return host(problem.masked(operator(other)).forward(theta)).astype(np.float64).ravel()
 
-    slope = (lines(cycles + NUDGE) - lines(cycles - NUDGE)) / (2 * NUDGE)
-    left = host(problem.used_samples) - lines(cycles)
+    slopes = np.stack(
+        [(lines(speeds + nudge) - lines(speeds - nudge)) / (2 * NUDGE) for nudge in np.diag(NUDGE * unit)]
+    )
+    left = host(problem.used_samples).ravel() - lines(speeds)
     # Lines without light have no slope.
-    step = stride * float((slope * left).sum() / max(np.square(slope).sum(), np.finfo(np.float64).tiny))
-    fitted = basis.frames / (cycles + min(max(step, -FARTHEST), FARTHEST))
-    return max(fitted, 2 * basis.harmonics / SHARE_OF_NYQUIST)  # shorter ones have fewer harmonics
+    step = stride * np.linalg.lstsq(slopes @ slopes.T, slopes @ left, rcond=CERTAIN)[0]
+    step *= FARTHEST / max(abs(step).max(), FARTHEST)
+    while speed_range((speeds + unit * step)[1:] / (speeds + unit * step)[0])[0] < SLOWEST:
+        step /= 2
+    mean, *others = (speeds + unit * step).tolist()
+    changes = tuple(each / mean for each in others)
+    # Shorter ones have fewer harmonics.
+    shortest = 2 * basis.harmonics * speed_range(changes)[1] / SHARE_OF_NYQUIST
+    return max(basis.frames / mean, shortest), changes
 
 
-def describe_cycle(period_frames: float, frame_ns: float) -> str:
+def describe_cycle(period_frames: float, speed_changes: Sequence[float], frame_ns: float) -> str:
     """Return a sentence about a video of motion that repeats."""
-    period_s = period_frames * frame_ns * 1e-9
+    hz = 1e9 / (period_frames * frame_ns)
+    slowest, fastest = (hz * each for each in speed_range(speed_changes))
+    changes = fastest > NOTEWORTHY * slowest
+    between = f", {slowest:.4g} to {fastest:.4g} Hz as its speed changes," if changes else ""
     return (
-        f"the video shows motion that repeats at {1 / period_s:.5g} Hz as a single cycle, which predicts the "
+        f"the video shows motion that repeats at {hz:.5g} Hz{between} as a single cycle, which predicts the "
         "lines best: what happens only once is in it only if a bandwidth is given (reconstruct(bandwidth=))"
     )

@@ -130,7 +130,7 @@ def reuse_choice(bench: Workbench, trials: int) -> Estimate | None:
     moving = bench.attempt(choice.candidate(frames), FIRST_ITERATIONS, bright)
     if choice.period_frames:
         # What was handed over had more iterations.
-        moving = bench.follow_period(moving)
+        moving = bench.follow_speed(moving)
         moving = bench.attempt(moving.candidate, NEXT_ITERATIONS, moving)
     best = moving if bench.held_out.clearly_less(moving.errors, still.errors) else still
     return bench.finish(_strengthened(best)) if choice.fits(best.error, noise) else None

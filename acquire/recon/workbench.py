@@ -20,7 +20,7 @@ from acquire.recon.band import segment_operator
 from acquire.recon.basis import CyclicBasis, TemporalBasis, resized
 from acquire.recon.brightness import fit_brightness
 from acquire.recon.candidates import CALM, CYCLE, USUAL_ENERGY, VOLUME, Candidate, parameters
-from acquire.recon.cycle import FEWEST_HARMONICS, better_period, most_harmonics
+from acquire.recon.cycle import FEWEST_HARMONICS, better_speed, most_harmonics
 from acquire.recon.volume import VolumeTv
 
 if TYPE_CHECKING:
@@ -52,13 +52,17 @@ better."""
 BRIGHTER = 0.9
 """Largest error of a volume of changing brightness, relative to that of a constant one, for which it is
 preferred."""
-PERIOD_ROUNDS, LONG_STRIDE = 6, 4.0
-"""Largest number of fits of a period, in turn with its cycle, and how much farther than the fit says it is
-moved at first: a cycle adapts to a wrong period, which then looks nearly right."""
+SPEED_ROUNDS, MOST_CHANGES, LONG_STRIDE = 12, 3, 4.0
+"""Largest number of fits of a cycle's speed, in turn with the cycle; number of its changes; and how much
+farther than the fit says the speed is moved at first: a cycle adapts to a wrong one, which then looks nearly
+right."""
+WORTH_A_ROUND, MUCH_A_ROUND = 0.99, 0.9
+"""Largest error, relative to that before, with which the same kind of fit goes on: near a rival's, and far
+from it. A wrong change of speed loses 10 to 50 % in a round, and what does not repeat nothing."""
 NEARLY_REPEATS, NO_CYCLE = 1.3, 4.0
-"""Largest error of a cycle, relative to a rival's, for which its period is fitted: a tenth of a cycle too
-many makes 0.8 out of 0.6, and sometimes 1.15. The other is that for which its first trial goes on: bright
-lines on dark ground begin at up to 2.8 and end at 0.7."""
+"""Largest error of a cycle, relative to a rival's, that is near: a tenth of a cycle too many makes 0.8 out of
+0.6, and sometimes 1.15. The other is that for which its first trial goes on: bright lines on dark ground
+begin at up to 2.8 and end at 0.7, and a fan whose speed changes begins at 2.4 and ends at 0.8."""
 PARTS = (3, 2)
 """Parts of a period that are tried, each as long as it helps."""
 PROBE, HOPELESS = 10, 2.5
@@ -126,7 +130,7 @@ class Workbench:
         self._brightness: NDArray[Any] | None = None  # of the next trials; a trial keeps its own
         self._bright_cosines = self.frames
         # Successive trials mostly share one.
-        self._operators: dict[tuple[int, bool, float], Operator] = {}
+        self._operators: dict[tuple[int, bool, tuple[float, ...]], Operator] = {}
 
         # This is the energy of the normalised lines' response to steady light in the voxel in the middle of
         # the picture.
@@ -196,43 +200,60 @@ class Workbench:
         self._use_brightness(best.brightness)
         return best
 
-    def repeat(self, period_frames: float, rival: float) -> Trial:
+    def repeat(self, period_frames: float, speed_changes: tuple[float, ...], rival: float) -> Trial:
         """Try a cycle of about this period, or of a part of it, since a multiple of a period is one, too."""
-        best = self._cycle(period_frames, rival)
+        best = self._cycle(period_frames, speed_changes, rival)
         for part in PARTS:
-            while best.error < rival and not self.clock.spent(SEARCH_SHARE):
-                shorter = best.candidate.period_frames / part
-                if most_harmonics(shorter) < FEWEST_HARMONICS:
+            while best.error < NEARLY_REPEATS * rival and not self.clock.spent(SEARCH_SHARE):
+                shorter, changes = best.candidate.period_frames / part, best.candidate.speed_changes
+                if most_harmonics(shorter, changes) < FEWEST_HARMONICS:
                     break
-                found = self._cycle(shorter, best.error)
+                found = self._cycle(shorter, changes, best.error)
                 if found.error > best.error:
                     break
                 best = found
         return best
 
-    def _cycle(self, period_frames: float, rival: float) -> Trial:
-        """A cycle, whose period is fitted to the lines if it may yet predict better than a rival."""
-        harmonics = min(CYCLE.coefficients // 2, most_harmonics(period_frames))
-        cycle = replace(CYCLE, coefficients=2 * harmonics + 1, period_frames=period_frames)
+    def _cycle(self, period_frames: float, speed_changes: tuple[float, ...], rival: float) -> Trial:
+        """A cycle, whose speed is fitted to the lines if it may yet predict better than a rival."""
+        harmonics = min(CYCLE.coefficients // 2, most_harmonics(period_frames, speed_changes))
+        cycle = replace(
+            CYCLE,
+            coefficients=2 * harmonics + 1,
+            period_frames=period_frames,
+            speed_changes=speed_changes,
+        )
         found = self.probe(self.fitting(cycle), rival, NO_CYCLE)
-        return self.follow_period(found) if found.error < NEARLY_REPEATS * rival else found
+        if found.error > NO_CYCLE * rival:
+            return found
+        return self.follow_speed(found, NEARLY_REPEATS * rival)
 
-    def follow_period(self, best: Trial) -> Trial:
-        """Fit the period and the cycle in turn as long as this improves the prediction."""
-        stride = LONG_STRIDE
-        for _ in range(PERIOD_ROUNDS):
-            basis = best.basis
+    def follow_speed(self, best: Trial, near: float = np.inf) -> Trial:
+        """Fit the speed and the cycle in turn as long as this improves the prediction.
+
+        While its error is larger than ``near``, it has to improve much in every round.
+        """
+        stride, order = LONG_STRIDE, len(best.candidate.speed_changes)
+        for _ in range(SPEED_ROUNDS):
+            basis, far = best.basis, best.error > near
+            # The comb's period is not wrong by as much as that.
+            order = max(order, 1) if far else order
             if self.clock.spent(SEARCH_SHARE) or not isinstance(basis, CyclicBasis):
                 break
             operator = partial(self._new_operator, None)
-            period = better_period(self.problem, best.admm.theta, basis, operator, stride)
-            found = self.attempt(replace(best.candidate, period_frames=period), PROBE, best)
-            if found.error < best.error:
+            period, changes = better_speed(self.problem, best.admm.theta, basis, operator, stride, order)
+            moved = replace(best.candidate, period_frames=period, speed_changes=changes)
+            found = self.attempt(moved, PROBE, best)
+            gained = found.error < WORTH_A_ROUND * best.error
+            enough = found.error < MUCH_A_ROUND * best.error if far else gained
+            # Changes of speed that are not worth a round stay out of the result.
+            if gained or (found.error < best.error and len(changes) == len(best.candidate.speed_changes)):
                 best = found
-            elif stride > 1:
-                stride = 1.0
-            else:
+            if enough:
+                continue
+            if far or (stride == 1 and order == MOST_CHANGES):
                 break
+            stride, order = (1.0, order) if stride > 1 else (LONG_STRIDE, MOST_CHANGES)
         return best
 
     def _fit_brightness(self, video: NDArray[Any], brightness: NDArray[Any] | None, cosines: int) -> None:
@@ -395,8 +416,8 @@ class Workbench:
         return None if self.background is None else resized(self.background, basis)
 
     def _operator(self, basis: TemporalBasis | CyclicBasis, brightness: NDArray[Any] | None) -> Operator:
-        period = basis.period_frames if isinstance(basis, CyclicBasis) else 0.0
-        key = (basis.count, brightness is not None, period)
+        motion = (basis.period_frames, *basis.speed_changes) if isinstance(basis, CyclicBasis) else ()
+        key = (basis.count, brightness is not None, motion)
         if key not in self._operators:
             self._operators[key] = self._new_operator(brightness, basis)
         return self._operators[key]

@@ -30,6 +30,7 @@ from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.polynomial import Legendre
 from PIL import Image as Pil
 from PIL import ImageDraw, ImageFont
 from scipy.ndimage import gaussian_filter
@@ -41,7 +42,7 @@ from acquire.lines import Segment
 from acquire.noise import Noise
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Sequence
 
     from numpy.typing import NDArray
 
@@ -351,12 +352,19 @@ SCENES = {
 }
 
 
-def light(name: str, seed: int, n: int, span: int) -> NDArray[np.float32]:
-    """Return the scene as a video (span, n, n)."""
+def light(
+    name: str, seed: int, n: int, span: int, speed_changes: Sequence[float] = ()
+) -> NDArray[np.float32]:
+    """Return the scene as a video (span, n, n).
+
+    Everything but lamps moves at 1 + Σ sᵢ·Pᵢ(x) of its usual speed, with ``speed_changes`` s₁, s₂, … and
+    Legendre's polynomials Pᵢ over the span, x = −1 … 1.
+    """
     frame = SCENES[name](Stage(n, span, seed))
+    moved = Legendre([1.0, *speed_changes]).integ(lbnd=-1) / 2
     video = np.empty((span, n, n), np.float32)
-    for t in range(span):
-        video[t] = frame(t, t / (span - 1))
+    for t, tau in enumerate(moved(np.linspace(-1, 1, span))):
+        video[t] = frame(t, float(tau))
     return video
 
 
@@ -368,11 +376,12 @@ def record(
     substeps: int = 3,
     lines: int = 263,
     camera: Camera = Camera(),
+    speed_changes: Sequence[float] = (),
 ) -> Recorded:
-    """Return the scene as recorded; ``seed`` determines scene, code and noise."""
+    """Return the scene as recorded; ``seed`` determines scene, code and noise (`light` has the rest)."""
     geometry = Geometry(stages, substeps, lines)
     code = prbs(31, mix_seed(seed, 31), 0, geometry.span)
-    video = light(name, seed, geometry.size, geometry.span)
+    video = light(name, seed, geometry.size, geometry.span, speed_changes)
     exact = DualArm(geometry, code).forward(video).astype(np.float64)
     return Recorded(expose(exact, geometry, code, camera, seed), video)
 

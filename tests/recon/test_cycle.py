@@ -14,9 +14,9 @@ from acquire.errors import UsageError
 from acquire.evaluate.metrics import psnr
 from acquire.recon import Reconstruction, reconstruct
 from acquire.recon.band import band_operator
-from acquire.recon.basis import CyclicBasis, TemporalBasis
+from acquire.recon.basis import CyclicBasis, TemporalBasis, speed_range
 from acquire.recon.candidates import CYCLE, Candidate
-from acquire.recon.cycle import better_period, find_period
+from acquire.recon.cycle import better_speed, find_period
 from acquire.recon.problem import build_problem
 from acquire.recon.reuse import Choice
 from acquire.recon.volume import VolumeTv
@@ -26,17 +26,17 @@ STAGES, LINES, VOXEL = 32, 160, 3
 
 
 @cache
-def recorded(scene: str, seed: int) -> Recorded:
-    return record(scene, seed, stages=STAGES, lines=LINES)
+def recorded(scene: str, seed: int, speed_changes: tuple[float, ...] = ()) -> Recorded:
+    return record(scene, seed, stages=STAGES, lines=LINES, speed_changes=speed_changes)
 
 
 @cache
-def result(scene: str, seed: int) -> Reconstruction:
-    return reconstruct(recorded(scene, seed).segment, VOXEL, 1)
+def result(scene: str, seed: int, speed_changes: tuple[float, ...] = ()) -> Reconstruction:
+    return reconstruct(recorded(scene, seed, speed_changes).segment, VOXEL, 1)
 
 
-def quality_db(found: Reconstruction, scene: str, seed: int) -> float:
-    return psnr(found.video[found.trusted], recorded(scene, seed).truth(VOXEL, 1))
+def quality_db(found: Reconstruction, scene: str, seed: int, speed_changes: tuple[float, ...] = ()) -> float:
+    return psnr(found.video[found.trusted], recorded(scene, seed, speed_changes).truth(VOXEL, 1))
 
 
 @settings(max_examples=40, deadline=None)
@@ -59,6 +59,27 @@ def test_the_harmonics_are_orthonormal_and_hold_what_repeats(
     video = 1 + sum(np.cos(2 * np.pi * h * t / period + h) / (h + 1) for h in range(harmonics + 1))
     held = basis.synthesize(basis.analyze(video.astype(np.float32)))
     np.testing.assert_allclose(held, video, atol=1e-3)
+
+
+@pytest.mark.parametrize("speed_changes", [(0.3,), (0.0, -0.2), (0.1, 0.05, -0.1)])
+def test_the_harmonics_follow_a_speed_that_changes(speed_changes: tuple[float, ...]) -> None:
+    frames, cycles = 400, 5.0
+    basis = CyclicBasis(frames, 3, frames / cycles, speed_changes=speed_changes)
+    rows = basis.matrix().astype(np.float64)
+    np.testing.assert_allclose(rows @ rows.T, np.eye(basis.count), atol=1e-4)
+    # The phase is the sum of the speeds, whatever it starts with.
+    at = np.linspace(-1, 1, 200 * frames)
+    speed = 1 + sum(s * np.polynomial.legendre.Legendre.basis(n)(at) for n, s in enumerate(speed_changes, 1))
+    phase = 2 * np.pi * cycles * np.cumsum(speed).reshape(frames, 200).mean(1) / len(at)
+    video = 1 + np.cos(phase + 0.3) + 0.5 * np.sin(3 * phase)
+    held = basis.synthesize(basis.analyze(video.astype(np.float32)))
+    np.testing.assert_allclose(held, video, atol=2e-3)
+    # The fastest cycle, not the mean one, says which cosines it needs, and how many harmonics frames show.
+    assert basis.cosines >= 2 * 3 * cycles * speed.max()
+    with pytest.raises(UsageError, match="harmonics"):
+        CyclicBasis(frames, 3, 6.2, speed_changes=(0.1,))
+    with pytest.raises(UsageError, match="harmonics"):
+        CyclicBasis(frames, 3, 100, speed_changes=(1.1,))  # it would turn back
 
 
 def test_coefficients_of_the_cosines_hold_most_of_the_same_video() -> None:
@@ -125,9 +146,23 @@ def test_the_period_of_what_repeats_is_found(cycles: float) -> None:
     # a bright line that passes each voxel once in a cycle
     video = np.exp(-(((t[:, None, None] - at + 0.5) % 1 - 0.5) ** 2) / 0.02)
     noise = 0.1 * np.random.default_rng(3).standard_normal(video.shape)
-    period = find_period(*coefficients(video + noise, 80))
-    assert period is not None
-    assert 600 / period == pytest.approx(cycles, abs=0.06)
+    found = find_period(*coefficients(video + noise, 80))
+    assert found is not None
+    assert 600 / found[0] == pytest.approx(cycles, abs=0.06)
+    # One step away from steady, ten cycles differ by a fifth of one.
+    assert sum(found[1]) == pytest.approx(0, abs=0.04)
+
+
+@pytest.mark.parametrize(("cycles", "rise"), [(4.0, 0.32), (9.3, -0.08), (9.3, 0.24)])
+def test_a_comb_is_found_at_a_speed_that_changes(cycles: float, rise: float) -> None:
+    x, at = np.linspace(-1, 1, 600), np.linspace(0, 1, 25).reshape(1, 5, 5)
+    t = cycles * (x + rise * x**2 / 2) / 2
+    video = np.exp(-(((t[:, None, None] - at + 0.5) % 1 - 0.5) ** 2) / 0.02)
+    noise = 0.1 * np.random.default_rng(3).standard_normal(video.shape)
+    found = find_period(*coefficients(video + noise, 80))
+    assert found is not None
+    assert 600 / found[0] == pytest.approx(cycles, abs=0.2)
+    assert found[1][0] == pytest.approx(rise, abs=0.05)
 
 
 def test_what_does_not_repeat_has_no_period() -> None:
@@ -140,12 +175,13 @@ def test_what_does_not_repeat_has_no_period() -> None:
     assert find_period(*coefficients(crossing, 6)) is None
 
 
-def test_a_period_is_fitted_to_the_lines() -> None:
+@pytest.mark.parametrize(("changes", "start"), [((), ()), ((0.03,), ()), ((0.1, -0.02), (0.08,))])
+def test_a_speed_is_fitted_to_the_lines(changes: tuple[float, ...], start: tuple[float, ...]) -> None:
     """From 1 % off, the right cycle shows the change that is missing; with light that is steady, none is."""
     segment = recorded("disc", 5).segment
     problem = build_problem(segment, VOXEL, 1, hold_out=0.0)
     frames, side, _ = segment.geometry.video_shape(VOXEL, 1)
-    right = CyclicBasis(frames, 3, frames / 4.0)
+    right = CyclicBasis(frames, 3, frames / 4.0, speed_changes=changes)
     theta = np.random.default_rng(5).random((7, side, side)).astype(np.float32)
 
     def operator(basis: CyclicBasis) -> object:
@@ -153,14 +189,34 @@ def test_a_period_is_fitted_to_the_lines() -> None:
 
     lines = operator(right).forward(theta)  # type: ignore[attr-defined]
     problem.samples[...] = problem.lines_of(lines)
-    off = CyclicBasis(frames, 3, frames / 4.04)
-    found = better_period(problem, theta, off, operator, 1.0)  # type: ignore[arg-type]
-    assert frames / found == pytest.approx(4.0, abs=0.01)
+    off = CyclicBasis(frames, 3, frames / 4.04, speed_changes=start)
+    order = len(changes)
+    period, found = better_speed(problem, theta, off, operator, 1.0, order)  # type: ignore[arg-type]
+    assert frames / period == pytest.approx(4.0, abs=0.01)
+    assert found == pytest.approx(changes, abs=0.01)
     steady = np.zeros_like(theta)
     steady[0] = 1
-    assert better_period(problem, steady, off, operator, 1.0) == pytest.approx(  # type: ignore[arg-type]
-        off.period_frames, rel=0.03
-    )
+    period, _ = better_speed(problem, steady, off, operator, 1.0, order)  # type: ignore[arg-type]
+    assert period == pytest.approx(off.period_frames, rel=0.03)
+
+
+def test_a_fit_never_turns_back() -> None:
+    """Lines that nothing explains may ask for any change, but the speed stays above a fifth of its mean."""
+    segment = recorded("disc", 5).segment
+    problem = build_problem(segment, VOXEL, 1, hold_out=0.0)
+    frames, side, _ = segment.geometry.video_shape(VOXEL, 1)
+    rng = np.random.default_rng(6)
+    theta = rng.random((5, side, side)).astype(np.float32)
+
+    def operator(basis: CyclicBasis) -> object:
+        return band_operator(segment.geometry, segment.code, basis, VOXEL, 1)
+
+    basis = CyclicBasis(frames, 2, frames / 2.0, speed_changes=(0.6, 0.0, 0.1))
+    for _ in range(8):
+        problem.samples[...] = rng.standard_normal(problem.samples.shape)
+        period, changes = better_speed(problem, theta, basis, operator, 50.0, 3)  # type: ignore[arg-type]
+        assert 0.2 <= speed_range(changes)[0] < 1
+        basis = CyclicBasis(frames, 2, period, speed_changes=changes)
 
 
 @pytest.mark.parametrize(("scene", "seed", "gain_db"), [("disc", 51, 2), ("fan", 51, 3), ("string", 52, 4)])
@@ -178,6 +234,26 @@ def test_motion_that_repeats_is_one_cycle(scene: str, seed: int, gain_db: float)
     free = reconstruct(segment, VOXEL, 1, bandwidth=24 / segment.geometry.span)
     assert not any("repeats" in each for each in free.warnings)
     assert quality_db(found, scene, seed) > quality_db(free, scene, seed) + gain_db
+
+
+@pytest.mark.parametrize(
+    ("scene", "seed", "speed_changes"),
+    [("fan", 51, (0.2,)), ("string", 81, (0.1, 0.05, -0.1))],
+)
+def test_motion_that_repeats_at_a_changing_speed_is_one_cycle(
+    scene: str, seed: int, speed_changes: tuple[float, ...]
+) -> None:
+    """Nearly as good as at a steady speed; if the speed is not followed, they lose 4 and 12 dB."""
+    found = result(scene, seed, speed_changes)
+    assert found.parameters["prior"] == "cycle"
+    assert quality_db(found, scene, seed, speed_changes) > quality_db(result(scene, seed), scene, seed) - 1.5
+    changes = np.zeros(3)
+    changes[: len(found.parameters["speed_changes"])] = found.parameters["speed_changes"]
+    assert changes[: len(speed_changes)] == pytest.approx(speed_changes, abs=0.03)
+    (told,) = [each for each in found.warnings if "repeats" in each]
+    assert "as its speed changes" in told
+    (steady,) = [each for each in result(scene, seed).warnings if "repeats" in each]
+    assert "as its speed changes" not in steady
 
 
 @pytest.mark.parametrize("scene", ["splash", "text", "bullet", "flame"])
