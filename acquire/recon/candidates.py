@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Literal
 from acquire.recon.admm import AdmmParameters
 from acquire.recon.basis import CyclicBasis, TemporalBasis
 from acquire.recon.cycle import most_harmonics
+from acquire.recon.ground import GroundedTv
 from acquire.recon.tv import FrameTv
 from acquire.recon.volume import Smooth, VolumeTv
 
@@ -29,6 +30,8 @@ HARMONICS = (2, 3, 5, 8, 12, 18)
 """Numbers of harmonics of motion that repeats."""
 LEAST_PACE, LARGEST_PACE = 0.25, 64.0
 LEAST_WEIGHT, LARGEST_WEIGHT = 1e-7, 1e3
+GROUND, LEAST_GROUND, NO_GROUND = 0.1, 1e-2, 1.0
+"""A ground's weight at first, and its limits; from the second on, a volume without one costs less."""
 WEIGHT_STEP, PACE_STEP = 10**0.5, 4.0
 USUAL_FRAMES, USUAL_ENERGY = 980, 7.1e-3
 """Number of frames and response to a voxel in Fig. 9, for which weights are given."""
@@ -39,6 +42,7 @@ class Candidate:
     """A prior and its parameters: K cosines, weight λ, pace μ (scale of a volume's time axis).
 
     Of a ``cycle``, the coefficients are the constant and its harmonics.
+    ``ground`` is the weight of a still ground behind a volume, relative to that of the volume; 0 is none.
     ``brightness``: times a free brightness of the whole scene; ``change``: the difference from the best
     still; ``fine``: solved at N_m = 1, then merged; ``robust``: samples with large residuals have less
     weight.
@@ -48,6 +52,7 @@ class Candidate:
     coefficients: int
     weight: float
     pace: float = 0.0
+    ground: float = 0.0
     brightness: bool = False
     change: bool = False
     fine: bool = False
@@ -61,6 +66,8 @@ class Candidate:
             return FrameTv(10)
         if self.prior == "smooth":
             return Smooth(self.pace)
+        if self.ground:
+            return GroundedTv(self.pace, self.ground)
         return VolumeTv(self.pace, cyclic=self.prior == "cycle")
 
     def basis(self, frames: int, arrays: Arrays) -> TemporalBasis | CyclicBasis:
@@ -71,7 +78,8 @@ class Candidate:
 
     def is_stronger_than(self, other: Candidate) -> bool:
         """Whether it leaves the video less freedom than ``other``, which differs in one parameter."""
-        return self.weight > other.weight or self.pace > other.pace or self.coefficients < other.coefficients
+        more = self.weight > other.weight or self.pace > other.pace or self.coefficients < other.coefficients
+        return more or (self.ground or NO_GROUND) > (other.ground or NO_GROUND)
 
     def with_weight(self, factor: float) -> Candidate | None:
         """The candidate with another weight; None beyond the limits."""
@@ -82,6 +90,11 @@ class Candidate:
         """The candidate with another pace; None beyond the limits."""
         pace = self.pace * factor
         return replace(self, pace=pace) if LEAST_PACE <= pace <= LARGEST_PACE else None
+
+    def with_ground(self, factor: float) -> Candidate | None:
+        """The candidate with another weight of its ground; None beyond the limits."""
+        ground = rounded((self.ground or NO_GROUND) * factor)
+        return replace(self, ground=ground) if LEAST_GROUND <= ground < NO_GROUND else None
 
     def with_coefficients(self, step: int, frames: int) -> Candidate | None:
         """The candidate with the next number of coefficients in either direction; None beyond the limits."""
@@ -105,12 +118,16 @@ class Candidate:
             yield partial(Candidate.with_pace, factor=by)
         for step in (1, -1):
             yield partial(Candidate.with_coefficients, step=step, frames=frames)
+        if self.prior == "volume":
+            for by in (1 / WEIGHT_STEP, WEIGHT_STEP) if self.ground else (GROUND,):
+                yield partial(Candidate.with_ground, factor=by)
 
 
 STILL = Candidate("still", 1, 2e-3)
 SMOOTH = Candidate("smooth", 24, 3e-3, 1.0)
 VOLUME = Candidate("volume", 24, 2e-3, 4.0)
 CALM = Candidate("volume", 24, 2e-3, 16.0)
+GROUNDED = Candidate("volume", 24, 2e-3, 4.0, ground=GROUND)
 CYCLE = Candidate("cycle", 2 * 8 + 1, 1e-3, 2.0)
 
 

@@ -33,7 +33,7 @@ from acquire.recon.blinking import (
     refine,
     solve_in_cosines,
 )
-from acquire.recon.candidates import CALM, SMOOTH, STILL, VOLUME
+from acquire.recon.candidates import CALM, GROUNDED, SMOOTH, STILL, VOLUME
 from acquire.recon.cycle import find_period
 from acquire.recon.estimates import Preferred, Refined
 from acquire.recon.given import Given
@@ -202,7 +202,9 @@ def _search(bench: Workbench, tried: _Tried, trials: int, rival: float) -> Trial
     plain = still = tried.plain
     calm = bench.attempt(bench.fitting(CALM), FIRST_ITERATIONS, plain)
     smooth = tried.smooth or bench.attempt(bench.fitting(SMOOTH), FIRST_ITERATIONS)
-    volume = min((each for each in (tried.volume, calm, tried.cycle) if each is not None), key=_error)
+    grounded = bench.attempt(bench.fitting(GROUNDED), FIRST_ITERATIONS)
+    volumes = (tried.volume, calm, grounded, tried.cycle)
+    volume = min((each for each in volumes if each is not None), key=_error)
     bright = tried.bright
     # To a brightness, a flash in front of a still is the flash of everything.
     flickers = bright is not None and bench.held_out.clearly_less(bright.errors, plain.errors)

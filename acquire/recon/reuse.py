@@ -50,6 +50,7 @@ class Choice:
     brightness: int = 0
     fine: bool = False
     period_frames: float = 0.0
+    ground: float = 0.0
 
     @classmethod
     def of(cls, result: Reconstruction) -> Self | None:
@@ -73,6 +74,7 @@ class Choice:
             brightness=counts[0] if found.get("brightness") and counts else 0,
             fine=bool(found.get("fine")),
             period_frames=found.get("period_frames", 0.0),
+            ground=found.get("ground", 0.0),
         )
 
     def fits(self, error: float, noise: float) -> bool:
@@ -99,7 +101,7 @@ class Choice:
         cosines = min(self.coefficients, frames)
         bright, fine = bool(self.brightness), self.fine
         known = {"brightness": bright, "fine": fine, "period_frames": self.period_frames}
-        return Candidate(self.prior, cosines, self.weight, self.pace, **known)  # type: ignore[arg-type]  # not cosines
+        return Candidate(self.prior, cosines, self.weight, self.pace, self.ground, **known)  # type: ignore[arg-type]  # not cosines
 
 
 def reuse_choice(bench: Workbench, trials: int) -> Estimate | None:

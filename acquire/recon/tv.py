@@ -35,6 +35,10 @@ class FrameTv:
         self._joint = joint
         self._dual: Array = None
 
+    def resume(self, other: FrameTv) -> None:
+        """Start from the dual field of another."""
+        self._dual = None if other._dual is None else namespace(other._dual).asarray(other._dual, copy=True)
+
     def value(self, frames: Array) -> float:
         """Σ_k TV(frames[k]); if joint, Σ over the pixels of √(Σ_k |∇frames[k]|²)."""
         if is_numpy_array(frames) and not self._joint:
