@@ -229,6 +229,9 @@ class RecordingStatus(Message):
     budget_lines: int | None
     recorded_lines: int = Field(description="rows that both arms have")
     committed_lines: int = Field(description="rows that a reader can see, in both arms")
+    beyond_bytes: int = Field(
+        default=0, description="bytes above recording.retention.max_gb, which are kept because lines are held"
+    )
 
 
 class LastRecording(Message):
