@@ -32,7 +32,7 @@ from acquire.store.layout import DAMAGE
 from acquire.store.opening import read_root, stated_format
 from acquire.store.refusals import refused
 from acquire.store.retention import holds_of
-from acquire.store.shortfall import first_shortfall, missing_segments
+from acquire.store.shortfall import damage_in_words
 from acquire.store.source import source_of
 from acquire.text import cause_in_words, shortened
 from acquire.web.messages import (
@@ -105,15 +105,15 @@ class Archive:
         """Return a recording with its events, gaps and holds. Raises PlaceError and DataError."""
         path = self.path_of(name)
         opened = open_recording(path)
+        # A damaged table is told as damage, and the rest is shown.
+        events = () if "events" in opened.unreadable else opened.events[-MOST_EVENTS:]
+        gaps = () if "gaps" in opened.unreadable else opened.gaps[-MOST_EVENTS:]
         return RecordingDetail(
             **_facts(path, opened).model_dump(),
-            event_list=[
-                EventFacts(kind=event.kind, line=event.line, text=event.text)
-                for event in opened.events[-MOST_EVENTS:]
-            ],
+            event_list=[EventFacts(kind=event.kind, line=event.line, text=event.text) for event in events],
             gap_list=[
                 GapFacts(arm=gap.arm, first_line=gap.first_line, count=gap.count, cause=gap.cause)
-                for gap in opened.gaps[-MOST_EVENTS:]
+                for gap in gaps
             ],
             hold_list=[
                 HoldFacts(first_line=int(first), count=int(count), why=str(why[0]) if why else "")
@@ -283,8 +283,6 @@ def _new_holds(path: Path, opened: Outline) -> list[Hold]:
 
 def _facts(path: Path, opened: Outline) -> RecordingFacts:
     info = opened.info()
-    shortfall = first_shortfall(opened)
-    damage = next(missing_segments(opened), None) if shortfall is None else str(shortfall)
     return RecordingFacts(
         name=path.name,
         run_id=info["run_id"],
@@ -302,7 +300,7 @@ def _facts(path: Path, opened: Outline) -> RecordingFacts:
         events=info["events"],
         held=bool(info["holds"] or _new_holds(path, opened)),
         uploaded=upload_target(opened.attrs),
-        damage=damage,
+        damage=damage_in_words(opened),
     )
 
 

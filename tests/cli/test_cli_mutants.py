@@ -314,6 +314,27 @@ def test_truncated_or_missing_parts_make_a_recording_damaged(
     assert not (tmp_path / "far.zarr").exists()
 
 
+@pytest.mark.parametrize("table", ["events/line", "gaps/cause"])
+def test_a_damaged_table_keeps_nothing_else_from_being_shown(
+    table: str, templates: dict[str, Path], tmp_path: Path, cli: Any
+) -> None:
+    path = tmp_path / "x.zarr"
+    with RecordingWriter.create(path, SPEC) as writer:
+        writer.add_event("mark", 5, 110, "x")
+        writer.add_gap("a", 103, 1, "camera")
+        writer.seal(RunCondition.GOOD, "done", {})
+    (path / table / "c" / "0").write_bytes(b"\0" * 40)
+    shown = cli("info", path)
+    assert shown.code == 0, shown.err
+    assert f"table {table} cannot be read: the checksum is wrong" in " ".join(shown.out.split())
+    assert f"unknown, since the {table.partition('/')[0]} cannot be read" in shown.out
+    facts = cli("info", path, "--json").json
+    assert (facts["events"], facts["suspect"]) == ((None, None) if "events" in table else (1, []))
+    assert facts["lost_lines"] == ({"a": 1, "b": 0} if "events" in table else None)
+    assert "DAMAGED" in cli("ls", tmp_path).out
+    assert cli("verify", path).code == 6
+
+
 def test_old_recordings_open(templates: dict[str, Path], tmp_path: Path, cli: Any) -> None:
     """Facts that came later may be absent: the first version wrote none of them."""
     path = tmp_path / "x.zarr"

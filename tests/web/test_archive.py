@@ -99,11 +99,13 @@ def test_no_damage_is_answered_as_a_defect_of_the_server(tmp_path: Path) -> None
     with RecordingWriter.create(tmp_path / "whole.zarr", make_spec()) as writer:
         fill(writer, 150)
         writer.add_event("mark", 5, 1000, "here")
+        writer.add_gap("a", 1003, 1, "camera")
         writer.seal(RunCondition.GOOD, "done", {})
     damages: dict[str, Callable[[Path], object]] = {
         "lines": lambda path: _truncate(path / "a" / "lines" / "c" / "0" / "0"),
         "arm": lambda path: shutil.rmtree(path / "b"),
         "events": lambda path: _truncate(path / "events" / "text" / "c" / "0"),
+        "gaps": lambda path: _truncate(path / "gaps" / "count" / "c" / "0"),
         "root": lambda path: _truncate(path / "zarr.json"),
         "no-root": lambda path: (path / "zarr.json").unlink(),
         "text": lambda path: _set_config(path / "zarr.json", "x"),
@@ -134,11 +136,16 @@ def test_no_damage_is_answered_as_a_defect_of_the_server(tmp_path: Path) -> None
     assert all("message" in answer.json() for answer in answers.values() if answer.status_code != 200)
     assert len(listed) == len(damages) + 2
     # What can be shown is shown.
-    assert {codes[name, of] for name in ("lines", "arm", "text", "number") for of in ("", "/picture")} == {
-        200
-    }
+    shown = ("lines", "arm", "text", "number", "events", "gaps")
+    assert {codes[name, of] for name in shown for of in ("", "/picture")} == {200}
     assert "cut short" in listed["lines.zarr"]["damage"]
-    assert codes["events", ""] == codes["root", "/picture"] == codes["no-root", "/hold"] == 424
+    details = {name: answers[name, ""].json() for name in ("whole", "events", "gaps")}
+    assert "table events/text cannot be read" in details["events"]["damage"]
+    assert (details["events"]["events"], details["events"]["event_list"]) == (None, [])
+    assert details["events"]["lost_lines"] == details["whole"]["lost_lines"] == {"a": 1, "b": 0}
+    assert "table gaps/count cannot be read" in details["gaps"]["damage"]
+    assert (details["gaps"]["lost_lines"], details["gaps"]["events"]) == (None, 1)
+    assert codes["root", "/picture"] == codes["no-root", "/hold"] == 424
 
 
 def test_the_first_list_is_made_before_anybody_asks(tmp_path: Path) -> None:
