@@ -225,6 +225,7 @@ class _Recoverer:
     def _publish(self, new_gaps: dict[str, list[tuple[int, int, str]]]) -> None:
         hidden = self.path / ARMS[0] / "lines"
         publisher = Publisher(hidden / SCRATCH, self.disk)
+        self._complete_directories()
         document = copy.deepcopy(self.recording.document)
         nodes: dict[str, layout.Document] = document["consolidated_metadata"]["metadata"]
         nodes |= self._tables(publisher, new_gaps)
@@ -250,6 +251,13 @@ class _Recoverer:
             if any(shard in shards for shards in listed):
                 remove(self.disk, self.path, Dropped(shard, listed))
         self.disk.sync_directory(self.path.parent)
+
+    def _complete_directories(self) -> None:
+        """Create the directories that are gone, as of a whole arm: the metadata in them is written anew."""
+        nodes = self.recording.document["consolidated_metadata"]["metadata"]
+        for place in (*nodes, f"{ARMS[0]}/lines"):
+            if not (self.path / place).is_dir():
+                self.disk.make_directory(self.path / place, parents=True)
 
     def _tables(
         self, publisher: Publisher, new_gaps: dict[str, list[tuple[int, int, str]]]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import json
 import os
+import shutil
 import time
 from dataclasses import replace
 
@@ -89,6 +90,19 @@ def test_a_flipped_bit_is_found_and_its_lines_are_flagged(path, array):
     assert verify(path).contradictions == ()
     again = recover(path)
     assert (again.changed, again.lines) == (False, 150)
+
+
+@pytest.mark.parametrize("arm", ["a", "b"])
+def test_an_arm_that_is_gone_is_flagged_as_missing(path, arm):
+    """Recovery flagged its lines, failed then for want of a directory, and the damage no longer showed."""
+    shutil.rmtree(write(path) / arm)
+    recovered = recover(path)
+    assert {damage.array for damage in recovered.damage} == set(ARRAYS)
+    assert open_recording(path).gaps == (Gap(arm, 1000, 150, "damaged"),)
+    assert open_recording(path).attrs["run_condition"] == "INCOMPLETE"
+    assert not recover(path).changed
+    flags = zarr.open_group(path, mode="r")[f"{arm}/flags"][:]
+    assert (flags & LineFlag.MISSING).all()
 
 
 @pytest.mark.parametrize(
