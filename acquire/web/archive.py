@@ -6,6 +6,7 @@ dedicated thread reads, so that a slow disk keeps nothing else waiting.
 
 from __future__ import annotations
 
+import os
 import stat
 from collections import OrderedDict
 from contextlib import suppress
@@ -17,6 +18,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from PIL import Image
 
+from acquire.daemon.messages import on_the_wire
 from acquire.errors import AcquireError, DataError, PlaceError, UsageError
 from acquire.flags import ARMS, NO_IMAGE
 from acquire.store import (
@@ -82,9 +84,12 @@ class Archive:
         self._ranges: OrderedDict[tuple[str, int], tuple[float, float]] = OrderedDict()
 
     def path_of(self, name: str, suffix: str = ".zarr") -> Path:
-        """Return the path of an entry. Raises PlaceError if it is not in the directory, or is a link."""
+        """Return the path of an entry. Raises PlaceError if it is not in the directory, or is a link.
+
+        ``name``: as in the lists, where a name that is not UTF-8 has escapes.
+        """
         # lstat, because a link could lead out of the directory.
-        path = self._directory / name
+        path = self._directory / self._real_name(name)
         invalid = not name.endswith(suffix) or "\0" in name or name in (".", "..") or Path(name).name != name
         try:
             mode = None if invalid else path.lstat().st_mode
@@ -96,6 +101,16 @@ class Archive:
                 f"there is no {shortened(name)} among the recordings", possible="/api/recordings"
             )
         return path
+
+    def _real_name(self, name: str) -> str:
+        """Return the entry's name on the disk, of which JSON can only have a readable form."""
+        if "\\" not in name:
+            return name
+        with suppress(OSError):  # told by whoever reads the entry
+            there = [entry.name for entry in os.scandir(self._directory)]
+            if name not in there:
+                return next((real for real in there if on_the_wire(real) == name), name)
+        return name
 
     def recordings(self) -> list[RecordingFacts]:
         """Return the recordings, newest first."""

@@ -109,8 +109,8 @@ class JobRequest(Message):
     """Long-running work on a recording."""
 
     kind: Literal["reconstruct", "preview", "cut"]
-    # No file system of Linux has longer names.
-    recording: str = Field(max_length=255)
+    # No file system of Linux has names of more than 255 bytes; an escape is of 6 characters.
+    recording: str = Field(max_length=6 * 255)
     first_line: int = Field(strict=True, ge=0, le=MOST_LINES)
     lines: int = Field(strict=True, ge=1, le=2**24)
     spatial_merge: int = Field(default=3, strict=True, ge=1, le=64)

@@ -9,12 +9,15 @@ import os
 import shutil
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
+from urllib.parse import quote
 
 import httpx
 import numpy as np
 import pytest
 from page_server import PageServer
 from store_helpers import fill, make_spec
+from waiting import until
 
 from acquire.capacity.load import Load, recording_spec
 from acquire.clock import ClockFit
@@ -146,6 +149,42 @@ def test_no_damage_is_answered_as_a_defect_of_the_server(tmp_path: Path) -> None
     assert "table gaps/count cannot be read" in details["gaps"]["damage"]
     assert (details["gaps"]["lost_lines"], details["gaps"]["events"]) == (None, 1)
     assert codes["root", "/picture"] == codes["no-root", "/hold"] == 424
+
+
+def test_names_that_json_cannot_have_are_opened_as_they_are_listed(tmp_path: Path) -> None:
+    """They were listed with escapes, and under the names in the list nothing was found."""
+    with RecordingWriter.create(tmp_path / "x.zarr", make_spec()) as writer:
+        fill(writer, 150)
+        writer.seal(RunCondition.GOOD, "done", {})
+    odd = {"caf\\udce9.zarr": b"caf\xe9.zarr", "\\x1b[0m.zarr": b"\x1b[0m.zarr", "a\nb.zarr": b"a\nb.zarr"}
+    odd |= {"back\\slash.zarr": b"back\\slash.zarr", "a #?%20.zarr": b"a #?%20.zarr"}
+    for name in odd.values():
+        shutil.copytree(tmp_path / "x.zarr", os.fsdecode(os.fsencode(tmp_path) + b"/" + name))
+    cuts: dict[str, Any] = {}
+    with (
+        contextlib.closing(PageServer(tmp_path / "c.sock", tmp_path)) as page,
+        httpx.Client(
+            base_url=f"{page.address}api", headers={"Authorization": f"Bearer {page.operator}"}, timeout=60
+        ) as ask,
+    ):
+        assert {one["name"] for one in ask.get("/recordings").json()} == {"x.zarr", *odd}
+        for name in odd:
+            asked = f"/recordings/{quote(name, safe='')}"
+            assert ask.get(asked).json()["name"] == name
+            assert ask.get(f"{asked}/picture").content.startswith(b"\x89PNG")
+            job = {"kind": "cut", "recording": name, "first_line": 1000, "lines": 16}
+            assert ask.post("/jobs", json=job).status_code == 200
+
+        def done() -> bool:
+            found = {job["recording"]: job for job in ask.get("/jobs").json()}
+            cuts.update(found)
+            return {job["state"] for job in found.values()} <= {"done", "failed"}
+
+        until(done, "the jobs")
+        for name in odd:
+            assert cuts[name]["state"] == "done", cuts[name]
+            made = ask.get(f"/cuts/{quote(cuts[name]['result'], safe='')}")
+            assert made.content.startswith(b"PK")
 
 
 def test_the_first_list_is_made_before_anybody_asks(tmp_path: Path) -> None:
