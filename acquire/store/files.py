@@ -396,7 +396,12 @@ class Publisher:
     def replace(self, path: Path, data: Buffer, *, durable: bool = False) -> None:
         """Replace ``path``; ``durable`` forces bytes and name to the medium before returning."""
         # Bytes first: otherwise a name might lead to an empty file after a power failure.
-        self.disk.write_file(self.scratch, data, durable=durable)
-        self.disk.rename(self.scratch, path)
+        try:
+            self.disk.write_file(self.scratch, data, durable=durable)
+            self.disk.rename(self.scratch, path)
+        except OSError:
+            with suppress(OSError):  # a disk that is full takes the name, but no byte
+                self.disk.remove(self.scratch)
+            raise
         if durable:
             self.disk.sync_directory(path.parent)

@@ -164,6 +164,8 @@ class _Recoverer:
 
     def run(self, progress: Callable[[int, int], None] | None) -> Recovery:
         recording = self.recording
+        if not self.sealed:  # its room is for what follows: the disk may be full
+            self.disk.remove(self.path / ARMS[0] / "lines" / RESERVE)
         # Indices first, since chunks are found by them. Then committed rows, and only then the rows after
         # them, which count only if every array of both arms has them.
         mended, first_shard = 0, self.first_row // self.shape.shard_rows

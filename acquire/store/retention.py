@@ -13,6 +13,7 @@ by a margin on both sides, which reconstruction needs to cut a segment there.
 from __future__ import annotations
 
 import json
+from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 from zlib import crc32
@@ -81,6 +82,8 @@ def hold(path: Path, first_line: int, count: int, why: str = "", disk: Disk = DI
         name = f"{first_line}-{count}.json"  # the same lines, held again, replace their file
         Publisher(directory / f".{name}", disk).replace(directory / name, text, durable=True)
     except OSError as error:
+        with suppress(OSError):  # only if it is empty
+            disk.remove_directory(directory)
         raise refusal(f"{path}: lines {first_line} to {first_line + count - 1}", error, "held") from error
     # Checked after writing the hold: the writer reads holds before it drops a shard, and again before it
     # deletes the shard.
