@@ -306,7 +306,7 @@ class _Recoverer:
             attributes["ledger"] = ledger = copy.deepcopy(attributes["ledger"])
             for arm, count in lost.items():
                 book = ledger.get(arm)
-                if count and isinstance(book, dict) and "stored" in book:
+                if count and isinstance(book, dict) and book.get("stored") is not None:
                     book["stored"] -= count
                     missing = book.setdefault("missing", {})
                     missing["damaged"] = missing.get("damaged", 0) + count
