@@ -105,6 +105,32 @@ def test_an_arm_that_is_gone_is_flagged_as_missing(path, arm):
     assert (flags & LineFlag.MISSING).all()
 
 
+@pytest.mark.parametrize("array", ARRAYS)
+@pytest.mark.parametrize("arm", ["a", "b"])
+def test_what_a_recovery_has_flagged_is_masked_in_a_cut(path, arm, array):
+    """A cut refused the range still, with the advice to recover the recording."""
+    whole = open_recording(write(path)).cut(1070, 40)
+    flip(path, arm, array, 5)  # lines 1080 to 1095
+    recover(path)
+    segment = open_recording(path).cut(1070, 40)
+    lost = np.zeros(whole.mask.shape, bool)
+    lost["ab".index(arm), 10:26] = True
+    np.testing.assert_array_equal(segment.mask, whole.mask & ~lost)
+    np.testing.assert_array_equal(segment.lines[~lost], whole.lines[~lost])
+    np.testing.assert_array_equal(segment.time_ns, whole.time_ns)
+    assert not open_recording(path).whole_lines(1070, 40)[1][lost].any()
+
+
+def test_times_of_lines_that_both_arms_have_lost_are_by_the_clock(path):
+    whole = open_recording(write(path)).cut(1070, 40)
+    for arm in ARMS:
+        flip(path, arm, "time", 5)
+    recover(path)
+    segment = open_recording(path).cut(1070, 40)
+    np.testing.assert_array_equal(segment.time_ns, whole.time_ns)
+    assert not segment.mask[:, 10:26].any()
+
+
 @pytest.mark.parametrize(
     ("array", "chunk", "rows"),
     [("lines", 5, range(80, 96)), ("lines", 9, range(144, 150)), ("tick", 2, range(64, 96))],
