@@ -196,6 +196,7 @@ def test_every_number_has_its_limits() -> None:
     ("changes", "words"),
     [
         ({"recording.reserve_gb": 1e8}, "recording.reserve_gb = 1e+08: the disk of"),
+        ({"recording.directory": "/proc"}, "the disk of /proc has no room at all"),  # it said "below 0"
         ({"recording.retention.max_gb": 1e-12}, "less than one file of each arm; possible:"),
         ({"recording.chunk_lines": 2**20, "geometry.stages": 4096}, "chunk_lines = 1048576; possible: 1 to"),
     ],

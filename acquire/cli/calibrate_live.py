@@ -39,6 +39,7 @@ def instrument(socket: Path | None, directory: Path) -> Iterator[Client]:
     """Connect to an idle or armed daemon, create ``directory``, and restore the daemon's state at the end."""
     from acquire.cli.progress import waiting_printer
     from acquire.client import Client
+    from acquire.store.refusals import refused
 
     # The page runs this command: the recording's events must name who pressed the button.
     WHO.set(os.environ.get(BY, "")[:LONGEST])
@@ -49,7 +50,8 @@ def instrument(socket: Path | None, directory: Path) -> Iterator[Client]:
                 f"the daemon is {status.state}", possible="idle or armed", hint="acquire stop, or disarm"
             )
         # Only now, so that a daemon in another state leaves no empty directory.
-        directory.mkdir(parents=True, exist_ok=True)
+        with refused(directory, "created"):
+            directory.mkdir(parents=True, exist_ok=True)
         calm_s = CALM_S
         try:
             yield daemon

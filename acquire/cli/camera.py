@@ -122,6 +122,8 @@ def snapshot(
 
 
 def _check_out(path: Path) -> None:
+    from acquire.store.files import no_directory
+
     if path.suffix.lower() not in (".png", ".npy"):
         raise UsageError(
             f"a snapshot cannot be saved as {path.name}: its suffix is not a known format",
@@ -133,8 +135,8 @@ def _check_out(path: Path) -> None:
             f"a snapshot cannot be saved to {path}: the file exists and is not overwritten",
             hint="--out with a new file",
         )
-    if not path.absolute().parent.is_dir():
+    if (no := no_directory(path.absolute().parent)) is not None:
+        why, _ = no
         raise UsageError(
-            f"a snapshot cannot be saved to {path}: there is no directory {path.absolute().parent}",
-            hint="--out in a directory that exists",
+            f"a snapshot cannot be saved to {path}: {why}", hint="--out in a directory that exists"
         )

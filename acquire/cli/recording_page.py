@@ -70,10 +70,18 @@ def recording_facts(facts: dict[str, Any]) -> dict[str, Any]:
         calibration = f"{', '.join(steps)}; {max(str(step.get('made', '')) for step in steps.values())}"
     # A daemon recovers it when it starts; without one, the command does.
     left = "; no process writes it any more: acquire recover" if _is_left(facts) else ""
-    suspect = [
-        f"{one['arm']} {one['first_line']} to {one['first_line'] + one['count'] - 1} ({one['why']})"
-        for one in facts["suspect"]
-    ]
+    # What a damaged table would tell is unknown, and not nothing.
+    doubts: str | None = "unknown, since the events cannot be read"
+    if facts["suspect"] is not None:
+        doubts = _some(
+            [
+                f"{one['arm']} {one['first_line']} to {one['first_line'] + one['count'] - 1} ({one['why']})"
+                for one in facts["suspect"]
+            ]
+        )
+    lost = "unknown, since the gaps cannot be read"
+    if facts["lost_lines"] is not None:
+        lost = ", ".join(f"{arm} {count}" for arm, count in facts["lost_lines"].items())
     # Held lines are kept all the same, and the disk may fill although there is a limit.
     most, beyond = facts["max_bytes"], ""
     if facts["holds"] and most is not None and facts["bytes"] > most:
@@ -102,9 +110,9 @@ def recording_facts(facts: dict[str, Any]) -> dict[str, Any]:
         "damaged": facts["damage"],
         "disk": _disk(facts["disk"]),
         "at risk": _at_risk(facts["durability"]),
-        "lost lines": ", ".join(f"{arm} {count}" for arm, count in facts["lost_lines"].items()),
+        "lost lines": lost,
         "tainted by": _some(taint_words(facts["ledger"].get("tainted_by", {}))),
-        "in doubt": _some(suspect),
+        "in doubt": doubts,
         "calibration": calibration,
         "simulated": "yes" if facts["simulated"] else "no",
         "imported": _imported(facts["imported"]),

@@ -90,19 +90,23 @@ def info(recording: PlaceArgument, json: JsonFlag = False) -> None:
     from acquire.store import open_outline, suspect_lines
 
     opened = open_outline(recording)
-    suspect = [found.to_dict() for found in suspect_lines(opened)]
-    facts = opened.info() | {"damage": _damage(opened), "suspect": suspect}
+    facts = opened.info() | {"damage": _damage(opened)}
+    # None: the table that would say so cannot be read, and neither can `gaps` be used.
+    facts["suspect"] = None
+    if "events" not in opened.unreadable:
+        facts["suspect"] = [found.to_dict() for found in suspect_lines(opened)]
+    gaps = () if "gaps" in opened.unreadable else opened.gaps
     if json:
-        gaps = [
+        listed = [
             {"arm": gap.arm, "first_line": gap.first_line, "count": gap.count, "cause": gap.cause}
-            for gap in opened.gaps
+            for gap in gaps
         ]
-        print_json({**facts, "gap_list": gaps})
+        print_json({**facts, "gap_list": listed})
         return
     print_facts(recording_facts(facts))
-    if opened.gaps:
+    if gaps:
         say()
-        rows = [(gap.arm, gap.first_line, gap.count, gap.cause) for gap in opened.gaps]
+        rows = [(gap.arm, gap.first_line, gap.count, gap.cause) for gap in gaps]
         print_table(("arm", "first lost line", "lines", "cause"), rows)
 
 
@@ -356,10 +360,10 @@ def _other_kind(path: Path) -> str | None:
 
 
 def _damage(recording: Outline) -> str | None:
-    """Find damage that shows without reading the lines: missing or truncated files, missing segments."""
-    from acquire.store.shortfall import first_shortfall, missing_segments
+    """Find damage that shows without reading the lines."""
+    from acquire.store.shortfall import damage_in_words
 
     if not recording.is_here:
-        return None  # the check would cost a request to the remote store for every file
-    found = first_shortfall(recording)
-    return next(missing_segments(recording), None) if found is None else str(found)
+        # Looking for files would cost a request to the remote store for each.
+        return "; ".join(recording.unreadable.values()) or None
+    return damage_in_words(recording)

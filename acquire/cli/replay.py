@@ -17,10 +17,11 @@ from acquire.cli.recordings import PlaceArgument
 from acquire.errors import AcquireError, DataError, UsageError
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Collection, Iterator
 
     from acquire.store.compare import Difference
     from acquire.store.reader import Recording
+    from acquire.store.shortfall import Damage
 
 FASTEST = 32.0
 """First speed tried by ``--speed 0``: at a few MHz, the trigger's tags alone keep a process busy."""
@@ -67,6 +68,7 @@ def replay(
 
     Example: [bold]acquire replay run.zarr --out again.zarr --speed 0[/]
     """
+    from acquire.store.array_files import COLUMNS
     from acquire.store.files import check_new_path
 
     if not 0 <= speed <= 1000:
@@ -78,6 +80,8 @@ def replay(
             raise UsageError("--loop with --out would never end", possible="one of them")
         check_new_path(out)
     with _local_recording(recording) as stored:
+        # Now, in a moment: otherwise a camera without its lines is a fault once all is armed, at every speed.
+        _refuse_shortfall(recording, stored, ("lines", "flags") if out is None else COLUMNS)
         if out is None:  # run the daemon in this process until it is stopped
             from acquire.cli.replay_rig import replay_rig
             from acquire.cli.serve import serve
@@ -166,17 +170,51 @@ def _replay_without_loss(stored: Recording, out: Path, speed: float) -> tuple[fl
         if fault is None:
             with stage_progress(f"comparing {out.name}") as advance:
                 return pace, compare(stored, open_recording(out), advance)
+        # Damage that lengths do not show: with it, no speed is slow enough.
+        if number == 0 and (found := _damage(stored)) is not None:
+            _discard(out)
+            raise _damaged(stored, found)
         if last:
             break
-        # Nothing of it existed before `_record`, nor did the segments in which the recording went on.
-        with suppress(AcquireError):  # no recording was begun, or it is damaged
-            for name in open_recording(out).attrs.get("segments", ()):
-                shutil.rmtree(out.with_name(name), ignore_errors=True)
-        shutil.rmtree(out, ignore_errors=True)
+        _discard(out)
     raise AcquireError(
         f"the replay to {out} lost lines at every speed that was tried, down to {pace:g}: {fault}",
         hint="fewer other processes on this host, or more memory, so that the ring can hold the recording",
     )
+
+
+def _refuse_shortfall(place: str, stored: Recording, needed: Collection[str]) -> None:
+    """Raise DataError if some of the arrays ``needed`` of either arm are not whole on disk."""
+    from acquire.store.shortfall import shortfalls
+
+    found = next((one for one in shortfalls(stored) if one.array in needed), None)
+    if found is not None:
+        raise _damaged(place, found)
+
+
+def _damage(stored: Recording) -> Damage | None:
+    """Read all of a recording; return its first damage."""
+    from acquire.store import verify
+
+    with stage_progress(f"verifying {stored.path.name}") as advance:
+        return next(iter(verify(stored.path, advance).damage), None)
+
+
+def _damaged(place: object, found: Damage) -> DataError:
+    return DataError(
+        f"{place} cannot be replayed: {found}",
+        hint="acquire recover, which flags lost lines as missing: they are then replayed as missing",
+    )
+
+
+def _discard(out: Path) -> None:
+    """Remove what `_record` has made, and the segments in which the recording went on."""
+    from acquire.store import open_outline
+
+    with suppress(AcquireError):  # no recording was begun, or it is damaged
+        for name in open_outline(out).attrs.get("segments", ()):
+            shutil.rmtree(out.with_name(name), ignore_errors=True)
+    shutil.rmtree(out, ignore_errors=True)
 
 
 def _record(stored: Recording, out: Path, speed: float) -> str | None:

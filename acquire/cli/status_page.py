@@ -87,9 +87,13 @@ def _recording(status: Facts) -> str | None:
     if now is None:
         return None
     budget = "" if now["budget_lines"] is None else f" of {now['budget_lines']}"
+    held = ""
+    if beyond := now.get("beyond_bytes", 0):
+        more = quantity(beyond, "B")
+        held = f"; WARNING: {more} more than recording.retention.max_gb allows: lines are held"
     return (
         f"{now['path']}, {now['recorded_lines']}{budget} lines from line {now['first_line']}, "
-        f"{now['committed_lines']} readable"
+        f"{now['committed_lines']} readable{held}"
     )
 
 

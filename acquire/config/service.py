@@ -38,8 +38,9 @@ class HooksConfig(FrozenModel):
 
     on: tuple[Literal["fault", "loss", "disk", "verdict", "trouble"], ...] = Field(
         default=("fault", "loss", "disk"),
-        description="'fault': the state is faulted; 'loss': lines were lost; 'disk': it is nearly full, or "
-        "has room again; 'verdict': the result of checking the light's code in the lines",
+        description="'fault': the state is faulted; 'loss': lines were lost; 'disk': it is nearly full, "
+        "has room again, or held lines exceed their limit; 'verdict': the result of checking the light's "
+        "code in the lines",
     )
     command: tuple[str, ...] = Field(
         default=(), description="program and arguments; the event is JSON on its standard input"

@@ -187,7 +187,9 @@ def _memory(rig: RigConfig | None) -> Finding:
 def _disk(directory: Path) -> Iterator[Finding]:
     path = directory.absolute()
     if not path.is_dir():
-        yield Finding("disk", "bad", f"{path} is not a directory", f"mkdir -p {path}, or recording.directory")
+        # Where something else is, none can be made.
+        make = "" if os.path.lexists(path) else f"mkdir -p {path}, or "
+        yield Finding("disk", "bad", f"{path} is not a directory", f"{make}recording.directory")
         return
     if not os.access(path, os.W_OK | os.X_OK):
         yield Finding("disk", "bad", f"{path} is not writable for this user", f"chown or chmod {path}")

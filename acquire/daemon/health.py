@@ -116,6 +116,8 @@ def _code(name: str, arm: ArmStatus) -> HealthCheck:
 
 def _of_service(status: Status) -> list[HealthCheck]:
     found = [disk_check(status.disk)]
+    if (held := held_check(status)) is not None:
+        found.append(held)
     if status.trigger is not None:
         answers = status.trigger.answers
         text = (
@@ -138,6 +140,25 @@ def _of_service(status: Status) -> list[HealthCheck]:
     if status.troubles:
         found.append(HealthCheck(name="troubles", level="warning", text=status.troubles[-1].text))
     return found
+
+
+def held_check(status: Status) -> HealthCheck | None:
+    """Judge whether held lines exceed the limit of retention; None while nothing is recorded."""
+    now = status.recording
+    if now is None:
+        return None
+    text = f"{now.path.name} is within its limit"
+    if now.beyond_bytes:
+        size = f"{now.beyond_bytes / 1e6:.0f} MB" if now.beyond_bytes >= 1e6 else f"{now.beyond_bytes} B"
+        text = f"{now.path.name} takes {size} more than recording.retention.max_gb allows: lines are held"
+    return HealthCheck(
+        name="held lines",
+        level="warning" if now.beyond_bytes else "good",
+        text=text,
+        value=now.beyond_bytes,
+        unit="B",
+        limit="good up to recording.retention.max_gb",
+    )
 
 
 def disk_check(disk: DiskStatus | None) -> HealthCheck:

@@ -37,11 +37,17 @@ def check_host(config: RigConfig) -> None:
     check_directory(config)
     recording = config.recording
     total_gb = shutil.disk_usage(recording.directory).total / 1e9
+    if not total_gb:  # such as /proc, or a file system that does not know its size
+        raise ConfigError(
+            f"recording.directory: the disk of {recording.directory.absolute()} has no room at all: "
+            "its file system states a size of 0 bytes",
+            hint="a directory on a disk",
+        )
     if recording.reserve_gb >= total_gb:
         raise ConfigError(
             f"recording.reserve_gb = {recording.reserve_gb:g}: the disk of {recording.directory.absolute()} "
             f"has {total_gb:.3g} GB in all",
-            possible=f"below {total_gb:.3g}",
+            possible=f"from 0 on, and below {total_gb:.3g}",
         )
     retention = recording.retention
     line_bytes = config.pixels * np.dtype(config.cameras.a.dtype).itemsize

@@ -26,14 +26,15 @@ from acquire.errors import (
 from acquire.text import visible
 
 
-def _on_the_wire(text: object) -> str:
+def on_the_wire(text: object) -> str:
+    """Return a text as it is in JSON."""
     return visible(text, lines=True)
 
 
 # On the wire only: in this process a text stays what it was.
-Text = Annotated[str, PlainSerializer(_on_the_wire, return_type=str, when_used="json")]
+Text = Annotated[str, PlainSerializer(on_the_wire, return_type=str, when_used="json")]
 """Text that is made readable and harmless in JSON, such as a file name that is not UTF-8."""
-Place = Annotated[Path, PlainSerializer(_on_the_wire, return_type=str, when_used="json")]
+Place = Annotated[Path, PlainSerializer(on_the_wire, return_type=str, when_used="json")]
 LONGEST_NAME = 200
 """Longest name of a recording in bytes: names derived from it, such as a further segment's, are longer."""
 LONGEST_MARK = 400
@@ -229,6 +230,9 @@ class RecordingStatus(Message):
     budget_lines: int | None
     recorded_lines: int = Field(description="rows that both arms have")
     committed_lines: int = Field(description="rows that a reader can see, in both arms")
+    beyond_bytes: int = Field(
+        default=0, description="bytes above recording.retention.max_gb, which are kept because lines are held"
+    )
 
 
 class LastRecording(Message):

@@ -108,6 +108,11 @@ class _Metrics(Collector):
         if (now := status.recording) is not None:
             waiting = now.recorded_lines - now.committed_lines
             yield _gauge("acquire_uncommitted_lines", "Lines not readable yet.", [((), waiting)])
+            yield _gauge(
+                "acquire_held_beyond_limit_bytes",
+                "Bytes above recording.retention.max_gb that are kept because lines are held.",
+                [((), now.beyond_bytes)],
+            )
         yield _gauge(
             "acquire_upload_pending_recordings", "Recordings not copied yet.", [((), status.uploads_left)]
         )

@@ -10,6 +10,7 @@ missed news. Facts that must be kept permanently are in the recordings' own even
 
 from __future__ import annotations
 
+import logging
 import secrets
 import threading
 import time
@@ -18,13 +19,15 @@ from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Any, cast, get_args
 
 from acquire.daemon.facts import Level, News, NewsKind
-from acquire.daemon.health import disk_check
+from acquire.daemon.health import disk_check, held_check
 from acquire.daemon.states import State
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
     from acquire.daemon.messages import Status
+
+log = logging.getLogger("acquire.daemon")
 
 MOST_KEPT = 2000
 LOSSES_EVERY_S = 1.0
@@ -139,7 +142,7 @@ class Changes:
         known = {one.text: one.times for one in before.troubles} if before else {}
         new = [one for one in status.troubles if one.times > known.get(one.text, 0)]
         troubles = [_fact("trouble", one.text, "error") for one in new]
-        found += self._disk_level(status) + troubles
+        found += self._disk_level(status) + _held(before, status) + troubles
         # Only the beginning and the end of a wait are news: its text changes every second.
         waited = bool(before and before.waiting)
         if status.waiting and not waited:
@@ -162,6 +165,16 @@ class Changes:
 
 def _fact(kind: NewsKind, text: str, level: Level = "info", **more: Any) -> dict[str, Any]:
     return {"kind": kind, "text": text, "level": level, **more}
+
+
+def _held(before: Status | None, after: Status) -> list[dict[str, Any]]:
+    """Report when the lines held in a recording begin to exceed its limit."""
+    was = before.recording if before else None
+    known = was.beyond_bytes if was and after.recording and was.path == after.recording.path else 0
+    if known or (check := held_check(after)) is None or check.level == "good":
+        return []
+    log.warning("%s", check.text)
+    return [_fact("disk", check.text, "warning")]
 
 
 def _verdicts(before: Status, after: Status) -> list[dict[str, Any]]:

@@ -49,6 +49,7 @@ class Take:
             budget_lines=self.lines,
             recorded_lines=seen.recorded_lines,
             committed_lines=seen.committed_lines,
+            beyond_bytes=seen.beyond_bytes,
         )
 
     def result(self, seen: CaptureStatus) -> LastRecording:

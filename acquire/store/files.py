@@ -48,8 +48,9 @@ def check_new_path(path: Path) -> None:
         raise UsageError(f"{str(path)!r} cannot be a path: {reason}", hint="another name") from error
     else:
         raise UsageError(f"{path} exists already", hint="another name; nothing is ever overwritten")
-    if not path.parent.is_dir():
-        raise UsageError(f"{path}: the directory {path.parent} does not exist", hint="create it first")
+    if (no := no_directory(path.parent)) is not None:
+        why, hint = no
+        raise UsageError(f"{path}: {why}", hint=hint)
     if not os.access(path.parent, os.W_OK | os.X_OK):
         raise UsageError(f"{path}: the directory {path.parent} is not writable", hint="another directory")
     inside = path.parent.resolve()
@@ -64,6 +65,20 @@ def check_new_path(path: Path) -> None:
                 possible="a path outside: a copy, a check or the end of retention takes the whole directory",
                 hint=str(directory.parent / path.name),
             )
+
+
+def no_directory(path: Path) -> tuple[str, str] | None:
+    """Return why ``path`` is not a directory, and what to try; None if it is one."""
+    if path.is_dir():
+        return None
+    # The first one on the way that is something else: below a file no directory can be created.
+    for way in (*reversed(path.parents), path):
+        if way.is_symlink() and not way.exists():
+            return f"{way} is a link to {way.readlink()}, which does not exist", "another directory"
+        if way.exists() and not way.is_dir():
+            kind = "a file" if way.is_file() else "something else"
+            return f"{way} is {kind} and not a directory", "a path in a directory"
+    return f"the directory {path} does not exist", "create it first"
 
 
 def write_all(fd: int, parts: Sequence[Buffer], offset: int) -> None:
@@ -381,7 +396,12 @@ class Publisher:
     def replace(self, path: Path, data: Buffer, *, durable: bool = False) -> None:
         """Replace ``path``; ``durable`` forces bytes and name to the medium before returning."""
         # Bytes first: otherwise a name might lead to an empty file after a power failure.
-        self.disk.write_file(self.scratch, data, durable=durable)
-        self.disk.rename(self.scratch, path)
+        try:
+            self.disk.write_file(self.scratch, data, durable=durable)
+            self.disk.rename(self.scratch, path)
+        except OSError:
+            with suppress(OSError):  # a disk that is full takes the name, but no byte
+                self.disk.remove(self.scratch)
+            raise
         if durable:
             self.disk.sync_directory(path.parent)

@@ -189,9 +189,21 @@ class Outline:
         """Events in the order in which they were noted."""
         return read_events(self.source, self._nodes)
 
+    @cached_property
+    def unreadable(self) -> dict[str, str]:
+        """Damaged tables, ``gaps`` or ``events``, and why they cannot be read. The lines do not need them."""
+        found = {}
+        for name in ("gaps", "events"):
+            try:
+                getattr(self, name)
+            except DataError as error:
+                found[name] = error.message.removeprefix(f"{self}: ")
+        return found
+
     def info(self) -> dict[str, Any]:
-        """Return a summary of the recording, as JSON."""
+        """Return a summary of the recording, as JSON; without the facts of a table that is `unreadable`."""
         period_ns, lines = self.line_period_ns, self.lines
+        gaps = None if "gaps" in self.unreadable else self.gaps
         keys = ("run_id", "state", "run_condition", "end_reason", "layout", "geometry", "clock")
         return {
             "path": str(self),
@@ -211,9 +223,11 @@ class Outline:
             "max_bytes": size_limit_bytes(self.attrs),
             "segment": self.attrs.get("segment"),
             "segments": self.attrs.get("segments", []),
-            "gaps": len(self.gaps),
-            "lost_lines": {arm: sum(gap.count for gap in self.gaps if gap.arm == arm) for arm in ARMS},
-            "events": len(self.events),
+            "gaps": None if gaps is None else len(gaps),
+            "lost_lines": None
+            if gaps is None
+            else {arm: sum(gap.count for gap in gaps if gap.arm == arm) for arm in ARMS},
+            "events": None if "events" in self.unreadable else len(self.events),
             "simulated": bool(self.attrs.get("simulated", False)),
             "cameras": self.attrs["cameras"],
             "imported": self.attrs.get("imported"),

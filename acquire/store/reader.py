@@ -25,6 +25,7 @@ from acquire.store.camera_stream import CameraStream
 from acquire.store.opening import opened
 from acquire.store.outline import Outline
 from acquire.store.overview import read_overview
+from acquire.store.present import present_values
 from acquire.store.source import source_of
 
 if TYPE_CHECKING:
@@ -138,9 +139,12 @@ class Recording(Outline):
         stretches = self._fetched(start, stop)
         # Read into their final place, without a copy of all of them.
         samples = np.empty((len(ARMS), lines, geometry.stages), self.arms["a"].dtype)
-        for arm, of_arm, those in zip(stretches.values(), samples, columns, strict=True):
-            arm["lines"].read(out=of_arm, columns=those)
         flags = np.stack([arm["flags"].read() for arm in stretches.values()])
+        for arm, of_arm, those, known in zip(ARMS, samples, columns, flags, strict=True):
+            try:
+                stretches[arm]["lines"].read(out=of_arm, columns=those)
+            except DataError:  # what a recovery has flagged as missing need not be there
+                of_arm[:] = self._present(arm, "lines", start, known)[:, those]
         cameras, noise = [self.attrs["cameras"][arm] for arm in ARMS], None
         # a rig need not give the cameras' noise
         if all(camera.get(key) is not None for camera in cameras for key in NOISE_KEYS):
@@ -151,7 +155,7 @@ class Recording(Outline):
             mask=self._usable(samples, flags),
             code=self._checked_code(first_line, geometry, flags, stretches),
             geometry=geometry,
-            time_ns=stretches["a"]["time"].read(),
+            time_ns=self._times(start, flags, stretches),
             first_line=first_line,
             substep_ns=self.line_period_ns / geometry.substeps,
             black_level_dn=self._per_arm("black_level_dn"),
@@ -169,10 +173,31 @@ class Recording(Outline):
         if (segment := self._segment_with(first_line)) is not None:
             return segment.whole_lines(first_line, lines)
         rows = self._rows(first_line, lines)
-        streams = self.arms.values()
-        samples = np.stack([stream.stretch("lines", *rows).read() for stream in streams])
-        flags = np.stack([stream.stretch("flags", *rows).read() for stream in streams])
+        flags = np.stack([stream.stretch("flags", *rows).read() for stream in self.arms.values()])
+        samples = np.stack(
+            [self._present(arm, "lines", rows[0], known) for arm, known in zip(ARMS, flags, strict=True)]
+        )
         return samples, self._usable(samples, flags)
+
+    def _present(self, arm: str, name: str, start: int, flags: NDArray[np.uint16]) -> NDArray[Any]:
+        """Return rows of an array; 0 for missing ones that are not on disk. Raises DataError for others."""
+        return present_values(self, arm, name, start, flags)
+
+    def _times(
+        self, start: int, flags: NDArray[np.uint16], stretches: dict[str, dict[str, Stretch]]
+    ) -> NDArray[np.int64]:
+        """Return the time of each row: of arm A, or of the other arm, or by the clock, if it is missing."""
+        try:
+            return stretches["a"]["time"].read()
+        except DataError:
+            times = [self._present(arm, "time", start, known) for arm, known in zip(ARMS, flags, strict=True)]
+        missing = (flags & LineFlag.MISSING) != 0
+        found: NDArray[np.int64] = np.where(missing[0], times[1], times[0]).astype(np.int64)
+        period, S = int(self.attrs["trigger"]["line_period_ticks"]), self.substeps
+        for row in np.flatnonzero(missing.all(axis=0)).tolist():
+            readout = (self.first_line + start + row) * S + self.geometry_for(1).readout_substep
+            found[row] = self.clock.instant_ns(readout * period // S)
+        return found
 
     def _columns(self, tile: Tile | None) -> tuple[slice, slice]:
         """Return the columns of arms A and B that see a tile, or all of them."""
@@ -271,7 +296,14 @@ class Recording(Outline):
         index = S * np.arange(first_line, first_line + lines, dtype=np.uint64)
         packed = np.packbits(bits[: S * lines].reshape(lines, S), axis=1, bitorder="little")[:, 0]
         for (arm, columns), arm_flags in zip(stretches.items(), flags, strict=True):
-            wrong = (columns["code"].read() != packed) | (columns["code_index"].read() != index)
+            try:
+                code, numbers = columns["code"].read(), columns["code_index"].read()
+            except DataError:
+                start = first_line - self.first_line
+                code, numbers = (
+                    self._present(arm, name, start, arm_flags) for name in ("code", "code_index")
+                )
+            wrong = (code != packed) | (numbers != index)
             wrong &= (arm_flags & LineFlag.MISSING) == 0  # filled with 0, as the rest of a missing line is
             if wrong.any():
                 line = first_line + int(wrong.argmax())

@@ -164,6 +164,8 @@ class _Recoverer:
 
     def run(self, progress: Callable[[int, int], None] | None) -> Recovery:
         recording = self.recording
+        if not self.sealed:  # its room is for what follows: the disk may be full
+            self.disk.remove(self.path / ARMS[0] / "lines" / RESERVE)
         # Indices first, since chunks are found by them. Then committed rows, and only then the rows after
         # them, which count only if every array of both arms has them.
         mended, first_shard = 0, self.first_row // self.shape.shard_rows
@@ -225,6 +227,7 @@ class _Recoverer:
     def _publish(self, new_gaps: dict[str, list[tuple[int, int, str]]]) -> None:
         hidden = self.path / ARMS[0] / "lines"
         publisher = Publisher(hidden / SCRATCH, self.disk)
+        self._complete_directories()
         document = copy.deepcopy(self.recording.document)
         nodes: dict[str, layout.Document] = document["consolidated_metadata"]["metadata"]
         nodes |= self._tables(publisher, new_gaps)
@@ -250,6 +253,13 @@ class _Recoverer:
             if any(shard in shards for shards in listed):
                 remove(self.disk, self.path, Dropped(shard, listed))
         self.disk.sync_directory(self.path.parent)
+
+    def _complete_directories(self) -> None:
+        """Create the directories that are gone, as of a whole arm: the metadata in them is written anew."""
+        nodes = self.recording.document["consolidated_metadata"]["metadata"]
+        for place in (*nodes, f"{ARMS[0]}/lines"):
+            if not (self.path / place).is_dir():
+                self.disk.make_directory(self.path / place, parents=True)
 
     def _tables(
         self, publisher: Publisher, new_gaps: dict[str, list[tuple[int, int, str]]]
@@ -296,7 +306,7 @@ class _Recoverer:
             attributes["ledger"] = ledger = copy.deepcopy(attributes["ledger"])
             for arm, count in lost.items():
                 book = ledger.get(arm)
-                if count and isinstance(book, dict) and "stored" in book:
+                if count and isinstance(book, dict) and book.get("stored") is not None:
                     book["stored"] -= count
                     missing = book.setdefault("missing", {})
                     missing["damaged"] = missing.get("damaged", 0) + count

@@ -13,6 +13,7 @@ by a margin on both sides, which reconstruction needs to cut a segment there.
 from __future__ import annotations
 
 import json
+from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 from zlib import crc32
@@ -81,6 +82,8 @@ def hold(path: Path, first_line: int, count: int, why: str = "", disk: Disk = DI
         name = f"{first_line}-{count}.json"  # the same lines, held again, replace their file
         Publisher(directory / f".{name}", disk).replace(directory / name, text, durable=True)
     except OSError as error:
+        with suppress(OSError):  # only if it is empty
+            disk.remove_directory(directory)
         raise refusal(f"{path}: lines {first_line} to {first_line + count - 1}", error, "held") from error
     # Checked after writing the hold: the writer reads holds before it drops a shard, and again before it
     # deletes the shard.
@@ -154,6 +157,8 @@ class Keeper:
     """Dropped shards, as ranges."""
     sizes: dict[int, int] = field(default_factory=dict)
     """Existing whole shard → bytes in all its arrays."""
+    beyond_bytes: int = 0
+    """Bytes above the policy's limit that remain because lines are held."""
     odd: set[int] = field(default_factory=set)
     """Shards that have become links: they are not deleted, and count as kept."""
 
@@ -187,18 +192,21 @@ class Keeper:
         excess = missing_bytes
         if self.policy.max_bytes is not None:
             excess = max(excess, sum(self.sizes.values()) + partly - self.policy.max_bytes)
-        going = []
+        going, kept = [], False
         age = self.policy.max_age_lines
         for shard in sorted(self.sizes):
             # What a segment around the newest line needs is kept, even if the disk is nearly full.
             if self._lines(shard).stop > newest - self.policy.margin_lines:
                 break
             if shard in self.odd or self._held(shard, held):
+                kept = True
                 continue
             if excess > 0 or (age is not None and self._lines(shard).stop <= newest - age):
                 going.append(shard)
                 excess -= self.sizes.pop(shard)
                 self.gone = _with(self.gone, shard)
+        most = self.policy.max_bytes
+        self.beyond_bytes = max(0, sum(self.sizes.values()) - most) if kept and most is not None else 0
         return going
 
     def delete(self, shards: list[int]) -> list[int]:

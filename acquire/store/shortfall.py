@@ -71,6 +71,17 @@ def first_shortfall(recording: Outline, shards: range | None = None) -> Damage |
     return found
 
 
+def damage_in_words(recording: Outline) -> str | None:
+    """Return the damage that shows without reading the lines, or None.
+
+    These are tables that cannot be read, files that are gone or cut short, and missing segments.
+    """
+    found: list[str] = list(recording.unreadable.values())
+    if "gaps" not in recording.unreadable and (shortfall := first_shortfall(recording)) is not None:
+        found.append(str(shortfall))
+    return "; ".join(found) or next(missing_segments(recording), None)
+
+
 def missing_segments(recording: Outline) -> Iterator[str]:
     """Yield what is wrong with the segments that a recording lists, in words."""
     for name in recording.attrs.get("segments", ()):

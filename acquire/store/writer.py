@@ -297,6 +297,11 @@ class RecordingWriter:
             return None
         return f"disk nearly full: {self.spec.reserve_bytes} bytes are kept free"
 
+    @property
+    def beyond_bytes(self) -> int:
+        """Bytes by which held lines exceed the limit of retention, as of the latest commit."""
+        return self._keeper.beyond_bytes if self._keeper else 0
+
     def seal(self, condition: RunCondition, end_reason: str, ledger: dict[str, Any]) -> None:
         """Write the waiting lines, pad their chunk with 0, end the recording, and force it to the medium.
 

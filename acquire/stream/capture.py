@@ -312,6 +312,7 @@ class Capture:
             first_line=began.first_line,
             recorded_lines=counters["recorded"],
             committed_lines=counters["committed"],
+            beyond_bytes=counters["beyond_bytes"],
             condition=sealed.condition if sealed else None,
             end_reason=sealed.end_reason if sealed else None,
             ledger=sealed.ledger if sealed else {},

@@ -175,6 +175,7 @@ class CaptureStatus:
     path : path of the latest recording; not the one requested if its recorder was killed and replaced
     first_line : the trigger's number of its row 0, or None before the first recording
     recorded_lines, committed_lines : rows that both arms have; rows that a reader finds
+    beyond_bytes : bytes by which held lines exceed the limit of retention
     ring : arm → slots, fill, peak, drops (blocks), dropped_lines, all since arm
     lines : arm → delivered, preroll, discarded (taken from the ring, but in no recording), lost by cause,
         and ``saturated`` (in at least one pixel), all since arm; of the latest recording ``recorded`` rows,
@@ -198,6 +199,7 @@ class CaptureStatus:
     first_line: int | None = None
     recorded_lines: int = 0
     committed_lines: int = 0
+    beyond_bytes: int = 0
     ring: dict[str, dict[str, int]] = field(default_factory=dict)
     lines: dict[str, dict[str, Any]] = field(default_factory=dict)
     waiting: str = ""

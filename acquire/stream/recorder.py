@@ -492,8 +492,8 @@ class Recorder:
     def _publish(self, session: Session) -> None:
         counters = self._counters
         rows = {name: book.next_line - session.first_line for name, book in session.books.items()}
-        counters["recorded"] = min(rows.values())
-        counters["committed"] = session.writer.committed_lines
+        counters["recorded"], counters["committed"] = min(rows.values()), session.writer.committed_lines
+        counters["beyond_bytes"] = session.writer.beyond_bytes
         counters["draining"] = session.ending and not (self._cut_short and self._plan.goes_on)
         for name, book in session.books.items():
             counters[f"rows_{name}"] = rows[name]

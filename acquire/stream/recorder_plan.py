@@ -12,13 +12,14 @@ if TYPE_CHECKING:
     from acquire.trigger.base import TriggerRun
 
 COUNTERS = (
-    *("recorded", "committed", "draining", "rows_a", "rows_b", "missing_a", "missing_b"),
+    *("recorded", "committed", "draining", "rows_a", "rows_b", "missing_a", "missing_b", "beyond_bytes"),
     *("discarded_a", "discarded_b", "stored_a", "stored_b", "turns", "awaited_a", "awaited_b"),
     *("unsaved_a", "unsaved_b", "overrun_a", "overrun_b", "overrun_to_a", "overrun_to_b"),
     *("disk_since_ns", "store_since_ns", "state"),
 )
 """Of the latest recording: rows in both arms (``recorded``), rows that a reader finds (``committed``),
-whether its last line is known (``draining``), and per arm the rows written and how many of them are missing.
+whether its last line is known (``draining``), and per arm the rows written and how many of them are missing;
+and by how much held lines exceed the limit of retention (``beyond_bytes``).
 
 Since arm, per arm: the lines taken from its ring into no recording (``discarded``), into one (``stored``),
 and those that a failed disk did not keep (``unsaved``); lines that found their ring full and are a gap in a

@@ -16,7 +16,7 @@ from starlette.staticfiles import StaticFiles
 
 from acquire.daemon.answers import Answers
 from acquire.daemon.control import new_app
-from acquire.daemon.messages import ErrorMessage
+from acquire.daemon.messages import ErrorMessage, on_the_wire
 from acquire.daemon.routes import NO_STORE, RequestId, routes
 from acquire.errors import AcquireError, BusyError, UsageError
 from acquire.web.archive import Archive
@@ -247,7 +247,7 @@ def _add_recordings(api: APIRouter, archive: Archive, reading: Reading, answers:
     @api.get("/cuts/{name}", summary="A range that was cut", responses=BYTES, response_class=Response)
     async def cut(name: str) -> FileResponse:
         path = await reading(lambda: archive.path_of(name, ".npz"))
-        return FileResponse(path, media_type="application/octet-stream", filename=name)
+        return FileResponse(path, media_type="application/octet-stream", filename=on_the_wire(name))
 
 
 def _add_jobs(api: APIRouter, jobs: Jobs, answers: Answers) -> None:

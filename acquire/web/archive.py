@@ -6,6 +6,7 @@ dedicated thread reads, so that a slow disk keeps nothing else waiting.
 
 from __future__ import annotations
 
+import os
 import stat
 from collections import OrderedDict
 from contextlib import suppress
@@ -17,6 +18,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from PIL import Image
 
+from acquire.daemon.messages import on_the_wire
 from acquire.errors import AcquireError, DataError, PlaceError, UsageError
 from acquire.flags import ARMS, NO_IMAGE
 from acquire.store import (
@@ -32,7 +34,7 @@ from acquire.store.layout import DAMAGE
 from acquire.store.opening import read_root, stated_format
 from acquire.store.refusals import refused
 from acquire.store.retention import holds_of
-from acquire.store.shortfall import first_shortfall, missing_segments
+from acquire.store.shortfall import damage_in_words
 from acquire.store.source import source_of
 from acquire.text import cause_in_words, shortened
 from acquire.web.messages import (
@@ -82,9 +84,12 @@ class Archive:
         self._ranges: OrderedDict[tuple[str, int], tuple[float, float]] = OrderedDict()
 
     def path_of(self, name: str, suffix: str = ".zarr") -> Path:
-        """Return the path of an entry. Raises PlaceError if it is not in the directory, or is a link."""
+        """Return the path of an entry. Raises PlaceError if it is not in the directory, or is a link.
+
+        ``name``: as in the lists, where a name that is not UTF-8 has escapes.
+        """
         # lstat, because a link could lead out of the directory.
-        path = self._directory / name
+        path = self._directory / self._real_name(name)
         invalid = not name.endswith(suffix) or "\0" in name or name in (".", "..") or Path(name).name != name
         try:
             mode = None if invalid else path.lstat().st_mode
@@ -97,6 +102,16 @@ class Archive:
             )
         return path
 
+    def _real_name(self, name: str) -> str:
+        """Return the entry's name on the disk, of which JSON can only have a readable form."""
+        if "\\" not in name:
+            return name
+        with suppress(OSError):  # told by whoever reads the entry
+            there = [entry.name for entry in os.scandir(self._directory)]
+            if name not in there:
+                return next((real for real in there if on_the_wire(real) == name), name)
+        return name
+
     def recordings(self) -> list[RecordingFacts]:
         """Return the recordings, newest first."""
         return [self._recording_facts(entry) for entry in self._entries(video=False)]
@@ -105,15 +120,15 @@ class Archive:
         """Return a recording with its events, gaps and holds. Raises PlaceError and DataError."""
         path = self.path_of(name)
         opened = open_recording(path)
+        # A damaged table is told as damage, and the rest is shown.
+        events = () if "events" in opened.unreadable else opened.events[-MOST_EVENTS:]
+        gaps = () if "gaps" in opened.unreadable else opened.gaps[-MOST_EVENTS:]
         return RecordingDetail(
             **_facts(path, opened).model_dump(),
-            event_list=[
-                EventFacts(kind=event.kind, line=event.line, text=event.text)
-                for event in opened.events[-MOST_EVENTS:]
-            ],
+            event_list=[EventFacts(kind=event.kind, line=event.line, text=event.text) for event in events],
             gap_list=[
                 GapFacts(arm=gap.arm, first_line=gap.first_line, count=gap.count, cause=gap.cause)
-                for gap in opened.gaps[-MOST_EVENTS:]
+                for gap in gaps
             ],
             hold_list=[
                 HoldFacts(first_line=int(first), count=int(count), why=str(why[0]) if why else "")
@@ -283,8 +298,6 @@ def _new_holds(path: Path, opened: Outline) -> list[Hold]:
 
 def _facts(path: Path, opened: Outline) -> RecordingFacts:
     info = opened.info()
-    shortfall = first_shortfall(opened)
-    damage = next(missing_segments(opened), None) if shortfall is None else str(shortfall)
     return RecordingFacts(
         name=path.name,
         run_id=info["run_id"],
@@ -302,7 +315,7 @@ def _facts(path: Path, opened: Outline) -> RecordingFacts:
         events=info["events"],
         held=bool(info["holds"] or _new_holds(path, opened)),
         uploaded=upload_target(opened.attrs),
-        damage=damage,
+        damage=damage_in_words(opened),
     )
 
 

@@ -7,6 +7,7 @@ a daemon that does not answer, and the connection is retried until it is back.
 from __future__ import annotations
 
 import asyncio
+import json
 import logging
 import time
 from collections import deque
@@ -18,6 +19,7 @@ from acquire.daemon.health import health_of
 from acquire.daemon.messages import Status
 from acquire.daemon.states import State
 from acquire.errors import AcquireError, NoDaemonError
+from acquire.text import visible
 from acquire.web.frames import json_message, message
 from acquire.web.glimpser import Glimpser
 from acquire.web.live import RECORDING_TURN_S, TURN_S
@@ -100,7 +102,8 @@ class Hub:
         status, health = self.status.model_dump_json(), self.health().model_dump_json()
         # No clock's time: the browser's may be wrong, and the host's may be set at any moment.
         for_s = self.status.state_s + time.monotonic() - self._status_s
-        facts = f'{{"for_s":{for_s:.3f},"status":{status},"health":{health}}}'
+        live = json.dumps(visible(self.live.error))
+        facts = f'{{"for_s":{for_s:.3f},"status":{status},"health":{health},"live_error":{live}}}'
         made = json_message("state", facts)
         self._made = self._version, time.monotonic(), made
         return made

@@ -78,7 +78,8 @@ class Jobs:
     def add(self, request: JobRequest) -> JobFacts:
         """Queue a job. Raises PlaceError if there is no such recording, StateError if the queue is full."""
         # The name comes from a browser: this refuses one that leads out of the directory.
-        self._archive.path_of(request.recording)
+        name = self._archive.path_of(request.recording).name
+        request = request.model_copy(update={"recording": name})
         if sum(job.facts.state == "waiting" for job in self._jobs.values()) >= MOST_WAITING:
             raise StateError(f"{MOST_WAITING} jobs are waiting already", hint="stop one of them")
         facts = JobFacts(

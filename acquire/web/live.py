@@ -56,7 +56,7 @@ class Live:
         self.turn_s = TURN_S
         """Time between two pictures; may be set at any time."""
         self.error = ""
-        """The reason why there is no picture."""
+        """The reason why there is no picture; empty once there is one, and while none is to be shown."""
 
     def begin(self) -> None:
         self._thread.start()
@@ -70,6 +70,7 @@ class Live:
     def show(self, rings: Rings | None, setup: Setup | None) -> None:
         """Read these rings from now on, or none."""
         self._wanted = (rings, setup) if rings is not None and setup is not None and rings.arms else None
+        self.error = ""
         self._changed.set()
 
     def watch(self) -> int:
@@ -114,6 +115,7 @@ class Live:
     def _fail(self, why: str) -> None:
         """Say why there is no picture, and wait before the next try."""
         self.error = why
+        self._wake()
         self._changed.wait(RETRY_S)
         self._changed.clear()
 
@@ -123,7 +125,6 @@ class Live:
         try:
             for arm, place in rings.arms.items():
                 arms[arm] = _ArmReader(arm, place.path, shape_of(place), setup)
-            self.error = ""
             while not self._ended and self._watchers and self._wanted == (rings, setup):
                 began_s = time.monotonic()
                 for reader in arms.values():
@@ -131,6 +132,7 @@ class Live:
                         with self._lock:
                             self._messages.append((self._count, content))
                             self._count += 1
+                self.error = ""  # not before: what fails in every turn would be told and withdrawn in turns
                 self._wake()
                 left_s = self.turn_s - (time.monotonic() - began_s)
                 if left_s > 0:

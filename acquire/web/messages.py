@@ -38,9 +38,9 @@ class RecordingFacts(Message):
     line_rate_hz: float = 0.0
     bytes: int = 0
     start_ns: int | None = None
-    lost_lines: dict[str, int] = Field(default={})
+    lost_lines: dict[str, int] | None = Field(default={}, description="null: the gaps cannot be read")
     tainted_by: list[Text] = Field(default=[], description="the reasons to doubt stored lines")
-    events: int = 0
+    events: int | None = Field(default=0, description="null: they cannot be read")
     held: bool = Field(default=False, description="some of its lines are protected from retention")
     uploaded: Text | None = Field(default=None, description="URL to which it is copied")
     damage: Text | None = None
@@ -109,8 +109,8 @@ class JobRequest(Message):
     """Long-running work on a recording."""
 
     kind: Literal["reconstruct", "preview", "cut"]
-    # No file system of Linux has longer names.
-    recording: str = Field(max_length=255)
+    # No file system of Linux has names of more than 255 bytes; an escape is of 6 characters.
+    recording: str = Field(max_length=6 * 255)
     first_line: int = Field(strict=True, ge=0, le=MOST_LINES)
     lines: int = Field(strict=True, ge=1, le=2**24)
     spatial_merge: int = Field(default=3, strict=True, ge=1, le=64)

@@ -6,9 +6,10 @@ allocates it, follows it out of the directory, or repeats it as if it were true.
 
 from __future__ import annotations
 
+import contextlib
 import json
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -17,13 +18,16 @@ import numpy as np
 import pytest
 
 from acquire.capacity.load import Load, recording_spec, trigger_run
+from acquire.cli import recordings
+from acquire.cli.replay_rig import replay_rig
 from acquire.clock import ClockFit
-from acquire.errors import DataError
+from acquire.errors import DataError, UsageError
 from acquire.lines import ARMS, LineBlock
-from acquire.store import RecordingWriter, RunCondition, verify
+from acquire.store import RecordingWriter, RunCondition, open_recording, verify
 from acquire.store.reader import open_source
 from acquire.store.source import LocalSource
 from acquire.stream.tagger import Tagger
+from acquire.web.archive import Archive
 
 CLOCK = ClockFit(90_000_000, 0, 0)
 LOAD = Load(8, "uint16", 1000.0, chunk_lines=16, shard_chunks=4)
@@ -312,6 +316,84 @@ def test_truncated_or_missing_parts_make_a_recording_damaged(
     refused = cli("upload", short, f"file://{tmp_path}/far.zarr")
     assert (refused.code, "is not copied: a/lines" in refused.err) == (6, True)
     assert not (tmp_path / "far.zarr").exists()
+
+
+WRONG: tuple[object, ...] = (None, "x", [], {}, -1, 10**30, float("nan"), "\ud800")
+
+
+def places(value: object, at: tuple[str, ...] = ()) -> Iterator[tuple[str, ...]]:
+    """Every value of the attributes, however deep."""
+    yield at
+    if isinstance(value, dict):
+        for key in value:
+            yield from places(value[key], (*at, key))
+
+
+@pytest.mark.parametrize(
+    "key",
+    [
+        *("state", "run_condition", "end_reason", "run_id", "layout", "first_line", "geometry", "trigger"),
+        *("clock", "code", "cameras", "ledger", "versions", "config", "host", "durability", "calibration"),
+        *("dropped", "holds", "segments", "segment", "imported", "plugins", "simulated", "effects", "scene"),
+    ],
+)
+def test_whatever_an_attribute_is_the_recording_is_shown_or_refused_in_words(
+    key: str, templates: dict[str, Path], tmp_path: Path
+) -> None:
+    """By the commands' own functions and the page's: any other exception is a traceback, or an HTTP 500."""
+    path = tmp_path / "x.zarr"
+    shutil.copytree(templates["sealed"], path)
+    whole = json.loads((path / "zarr.json").read_bytes())
+    # What it is deep inside is checked as well.
+    within = list(places(whole["attributes"][key])) if key in whole["attributes"] else [()]
+    for deep in within:
+        for value in WRONG:
+            document = json.loads((path / "zarr.json").read_bytes())
+            document["attributes"] = json.loads(json.dumps(whole["attributes"]))
+            at, (*parents, last) = document["attributes"], (key, *deep)
+            for parent in parents:
+                at = at[parent]
+            at[last] = value
+            (path / "zarr.json").write_text(json.dumps(document))
+            shown: list[Callable[[], object]] = [
+                lambda: recordings.info(str(path), json=True),
+                lambda: recordings.info(str(path)),
+                lambda: recordings.list_recordings(tmp_path),
+                lambda: open_recording(path).cut(110, 10),
+                lambda: verify(path),
+                lambda: replay_rig(open_recording(path), 1.0, tmp_path),
+                lambda: [one.model_dump_json() for one in Archive(tmp_path).recordings()],
+                lambda: Archive(tmp_path).recording("x.zarr").model_dump_json(),
+                lambda: Archive(tmp_path).picture("x.zarr"),
+            ]
+            try:
+                open_recording(path)
+            except DataError:
+                shown = [shown[0], shown[2], shown[6]]  # the others begin by opening it
+            for show in shown:
+                with contextlib.suppress(DataError, UsageError):
+                    show()
+
+
+@pytest.mark.parametrize("table", ["events/line", "gaps/cause"])
+def test_a_damaged_table_keeps_nothing_else_from_being_shown(
+    table: str, templates: dict[str, Path], tmp_path: Path, cli: Any
+) -> None:
+    path = tmp_path / "x.zarr"
+    with RecordingWriter.create(path, SPEC) as writer:
+        writer.add_event("mark", 5, 110, "x")
+        writer.add_gap("a", 103, 1, "camera")
+        writer.seal(RunCondition.GOOD, "done", {})
+    (path / table / "c" / "0").write_bytes(b"\0" * 40)
+    shown = cli("info", path)
+    assert shown.code == 0, shown.err
+    assert f"table {table} cannot be read: the checksum is wrong" in " ".join(shown.out.split())
+    assert f"unknown, since the {table.partition('/')[0]} cannot be read" in shown.out
+    facts = cli("info", path, "--json").json
+    assert (facts["events"], facts["suspect"]) == ((None, None) if "events" in table else (1, []))
+    assert facts["lost_lines"] == ({"a": 1, "b": 0} if "events" in table else None)
+    assert "DAMAGED" in cli("ls", tmp_path).out
+    assert cli("verify", path).code == 6
 
 
 def test_old_recordings_open(templates: dict[str, Path], tmp_path: Path, cli: Any) -> None:

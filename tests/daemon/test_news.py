@@ -164,6 +164,22 @@ def test_a_disk_that_fills_is_reported_once() -> None:
     assert changes.of(status(disk=disk(90.0))) == []
 
 
+def recording(beyond_bytes: int, path: str = "/d/x.zarr") -> dict[str, Any]:
+    lines = {"first_line": 0, "budget_lines": None, "recorded_lines": 9, "committed_lines": 9}
+    return {"path": path, "beyond_bytes": beyond_bytes, **lines}
+
+
+def test_held_lines_beyond_the_limit_are_reported_once(caplog: pytest.LogCaptureFixture) -> None:
+    changes = Changes()
+    assert changes.of(status(recording=recording(0))) == []
+    (told,) = changes.of(status(recording=recording(3_000_000)))
+    words = "x.zarr takes 3 MB more than recording.retention.max_gb allows: lines are held"
+    assert (told["kind"], told["level"], told["text"]) == ("disk", "warning", words)
+    assert changes.of(status(recording=recording(4_000_000))) == []
+    assert caplog.messages == [words]
+    assert [one["kind"] for one in changes.of(status(recording=recording(5, "/d/y.zarr")))].count("disk") == 1
+
+
 def test_an_unforeseen_error_is_reported_every_time_it_happens(tmp_path: Path) -> None:
     service = Service(rig_config(tmp_path), lambda _: FakeRun())
     for _ in range(2):
@@ -209,6 +225,7 @@ def test_the_service_tells_states_marks_and_faults(tmp_path: Path) -> None:
         (status(arm_status(saturated_part=0.2)), "degraded", "20.0% of the lines"),
         (status(arm_status(rate_hz=500.0)), "degraded", "500 lines/s of 1000"),
         (status(disk=disk(300.0)), "degraded", "full in 5 min"),
+        (status(recording=recording(7)), "degraded", "7 B more than recording.retention.max_gb allows"),
         (status(state=State.FAULTED, fault="no light"), "fault", "no light"),
     ],
 )

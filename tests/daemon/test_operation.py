@@ -318,7 +318,9 @@ def test_every_alert_is_on_a_metric_that_there_is(tmp_path: Path) -> None:
         arm.update(ledger={**ledger, "balanced": True}, check=check)
     numbers = ("free_bytes", "reserve_bytes", "bytes_per_s", "seconds_to_full")
     disk = {"directory": "/d", **dict.fromkeys(numbers, 1)}
-    full = type(service.status()).model_validate({**status, "trigger": trigger, "disk": disk})
+    recording = {"path": "/d/x.zarr", **dict.fromkeys(("first_line", "recorded_lines", "committed_lines"), 0)}
+    facts = {"trigger": trigger, "disk": disk, "recording": {**recording, "budget_lines": None}}
+    full = type(service.status()).model_validate({**status, **facts})
     told = metrics_text(full, Health(level="good", sentence="", lost_lines=0, checks=[])).decode()
     assert [name for name in sorted(named) if f"\n{name}" not in told] == []
     service.disarm()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -15,6 +16,7 @@ from s3_server import S3Server
 from acquire.cli import replay
 from acquire.clock import ClockFit
 from acquire.codes import PrbsCode
+from acquire.errors import DataError
 from acquire.lines import ARMS, LineFlag, LineTable, TaggedBlock
 from acquire.store import RecordingSpec, RecordingWriter, RunCondition, open_recording, recover
 
@@ -147,6 +149,46 @@ def test_a_recovered_recording_is_replayed_with_its_remaining_lines(tmp_path: Pa
     assert recover(path).damage
     replayed(path, "--out", tmp_path / "again.zarr", "--speed", 0)
     assert open_recording(tmp_path / "again.zarr").lost_rows("b") == open_recording(path).lost_rows("b") != []
+
+
+def test_a_recording_without_an_arm_is_refused_at_once_and_replayed_once_it_is_recovered(
+    tmp_path: Path,
+) -> None:
+    """It was tried at four speeds, each slower than the last, and lost lines at all of them."""
+    path = hard_recording(tmp_path / "hard.zarr", {"a": [], "b": []})
+    shutil.rmtree(path / "b")
+    for words in (("--out", tmp_path / "none.zarr"), ()):
+        refused = acquire("replay", path, *words)
+        assert refused.code == 6
+        assert "cannot be replayed: b/lines: lines 1001 to 2024: the file is gone" in " ".join(
+            refused.err.split()
+        )
+        assert "acquire recover, which flags lost lines as missing" in " ".join(refused.err.split())
+    assert sorted(one.name for one in tmp_path.iterdir()) == ["hard.zarr"]
+    assert recover(path).damage
+    replayed(path, "--out", tmp_path / "again.zarr", "--speed", 0)
+    assert open_recording(tmp_path / "again.zarr").lost_rows("b") == [range(LINES)]
+
+
+def test_damage_that_only_reading_shows_ends_a_replay_at_the_first_speed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    stored, out, paces = hard_recording(tmp_path / "run.zarr"), tmp_path / "again.zarr", []
+    shard = stored / "b" / "lines" / "c" / "1" / "0"
+    data = bytearray(shard.read_bytes())
+    data[4096 + 20] ^= 1
+    shard.write_bytes(data)
+
+    def record(_: object, path: Path, pace: float) -> str | None:
+        paces.append(pace)
+        hard_recording(path)
+        return "grabber b: lines cannot be read"
+
+    monkeypatch.setattr(replay, "_record", record)
+    with pytest.raises(DataError, match=r"run\.zarr cannot be replayed: b/lines: lines .* checksum is wrong"):
+        replay._replay_without_loss(open_recording(stored), out, 8.0)
+    assert paces == [8.0]
+    assert [path.name for path in tmp_path.iterdir()] == ["run.zarr"]
 
 
 @pytest.fixture

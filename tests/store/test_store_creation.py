@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import os
 import shutil
+from pathlib import Path
 
 import pytest
 import zarr
@@ -33,8 +34,15 @@ def test_nothing_is_overwritten_or_half_created(path, tmp_path):
     with pytest.raises(UsageError, match="exists already"):
         RecordingWriter.create(dangling, spec)
     (tmp_path / "file").touch()
-    with pytest.raises(UsageError, match="does not exist"):
-        RecordingWriter.create(tmp_path / "file" / "r.zarr", spec)
+    for below in ("r.zarr", "more/r.zarr"):  # none can be created there
+        with pytest.raises(
+            UsageError, match=r"/file is a file and not a directory; try: a path in a directory"
+        ):
+            RecordingWriter.create(tmp_path / "file" / below, spec)
+    with pytest.raises(UsageError, match=r"link\.zarr is a link to .*nowhere, which does not exist"):
+        RecordingWriter.create(dangling / "r.zarr", spec)
+    with pytest.raises(UsageError, match=r"/null is something else and not a directory"):
+        check_new_path(Path("/dev/null/r.zarr"))
 
 
 @pytest.mark.parametrize("name", ["x" * 300, "nul\0.zarr", "\ud800.zarr"])

@@ -17,13 +17,14 @@ import zarr
 from store_helpers import Truth, check_rows, fill, make_spec
 from waiting import until
 
-from acquire.errors import DataError, UsageError
+from acquire.errors import DataError, StoreError, UsageError
 from acquire.lines import ARMS
 from acquire.store import (
     RecordingWriter,
     RunCondition,
     choose_codec,
     files,
+    hold,
     measure_disk,
     open_recording,
     recover,
@@ -76,6 +77,26 @@ def test_a_disk_that_is_full_seals_what_it_has(small_disk, codec):
     assert recording.attrs["ledger"]["store"]["disk_error"].endswith("No space left on device")
     assert verify(path).intact
     check_rows(zarr.open_group(path, mode="r"), spec, recording.lines)
+
+
+@pytest.mark.needs_mount
+def test_on_a_full_disk_a_hold_leaves_nothing_and_a_recovery_has_its_reserve(small_disk):
+    """An empty file of the hold was left, and the recovery found no room although it had been reserved."""
+    path = small_disk / "r.zarr"
+    with RecordingWriter.create(path, make_spec()) as writer:
+        fill(writer, 150)
+        writer.commit()
+        lines = writer.committed_lines
+    with contextlib.suppress(OSError), (small_disk / "rest").open("wb", buffering=0) as rest:
+        while rest.write(bytes(4096)):
+            pass
+    before = sorted(path.rglob("*"))
+    with pytest.raises(StoreError, match=r"lines 1010 to 1014 cannot be held: No space left on device"):
+        hold(path, 1010, 5)
+    assert sorted(path.rglob("*")) == before
+    assert recover(path).lines == lines
+    assert open_recording(path).state == "sealed"
+    assert verify(path).intact
 
 
 @pytest.mark.needs_mount

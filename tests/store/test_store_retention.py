@@ -77,6 +77,21 @@ def test_the_size_is_bounded(path):
         assert len(left(bounded)) < 5
 
 
+def test_by_how_much_held_lines_exceed_the_size_is_known(path):
+    with RecordingWriter.create(path, spec_of(None)) as writer:
+        grow(writer, 2 * SHARD)
+        size = shard_bytes(path, 0)
+    bounded = path.with_name("bounded.zarr")
+    with RecordingWriter.create(bounded, spec_of(Retention(max_bytes=4 * size, margin_lines=16))) as writer:
+        grow(writer, 8 * SHARD)
+        assert writer.beyond_bytes == 0
+        hold(bounded, 1000 + 7 * SHARD, 2**40)
+        grow(writer, 8 * SHARD)
+        kept = sum(shard_bytes(bounded, shard) for shard in left(bounded))
+        assert kept > 4 * size
+        assert writer.beyond_bytes == kept - 4 * size
+
+
 def test_the_margin_behind_the_newest_line_always_stays(path):
     policy = Retention(max_age_lines=1, margin_lines=3 * SHARD)
     with RecordingWriter.create(path, spec_of(policy)) as writer:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import json
 import os
+import shutil
 import time
 from dataclasses import replace
 
@@ -89,6 +90,45 @@ def test_a_flipped_bit_is_found_and_its_lines_are_flagged(path, array):
     assert verify(path).contradictions == ()
     again = recover(path)
     assert (again.changed, again.lines) == (False, 150)
+
+
+@pytest.mark.parametrize("arm", ["a", "b"])
+def test_an_arm_that_is_gone_is_flagged_as_missing(path, arm):
+    """Recovery flagged its lines, failed then for want of a directory, and the damage no longer showed."""
+    shutil.rmtree(write(path) / arm)
+    recovered = recover(path)
+    assert {damage.array for damage in recovered.damage} == set(ARRAYS)
+    assert open_recording(path).gaps == (Gap(arm, 1000, 150, "damaged"),)
+    assert open_recording(path).attrs["run_condition"] == "INCOMPLETE"
+    assert not recover(path).changed
+    flags = zarr.open_group(path, mode="r")[f"{arm}/flags"][:]
+    assert (flags & LineFlag.MISSING).all()
+
+
+@pytest.mark.parametrize("array", ARRAYS)
+@pytest.mark.parametrize("arm", ["a", "b"])
+def test_what_a_recovery_has_flagged_is_masked_in_a_cut(path, arm, array):
+    """A cut refused the range still, with the advice to recover the recording."""
+    whole = open_recording(write(path)).cut(1070, 40)
+    flip(path, arm, array, 5)  # lines 1080 to 1095
+    recover(path)
+    segment = open_recording(path).cut(1070, 40)
+    lost = np.zeros(whole.mask.shape, bool)
+    lost["ab".index(arm), 10:26] = True
+    np.testing.assert_array_equal(segment.mask, whole.mask & ~lost)
+    np.testing.assert_array_equal(segment.lines[~lost], whole.lines[~lost])
+    np.testing.assert_array_equal(segment.time_ns, whole.time_ns)
+    assert not open_recording(path).whole_lines(1070, 40)[1][lost].any()
+
+
+def test_times_of_lines_that_both_arms_have_lost_are_by_the_clock(path):
+    whole = open_recording(write(path)).cut(1070, 40)
+    for arm in ARMS:
+        flip(path, arm, "time", 5)
+    recover(path)
+    segment = open_recording(path).cut(1070, 40)
+    np.testing.assert_array_equal(segment.time_ns, whole.time_ns)
+    assert not segment.mask[:, 10:26].any()
 
 
 @pytest.mark.parametrize(

@@ -39,6 +39,7 @@ class MemoryWriter:
     committed_lines: int = 0
     kept_lines: int = 0
     nearly_full: str | None = None
+    beyond_bytes: int = 0
     packs: bool = False
 
     def append(self, block: TaggedBlock, *, lent: bool = False) -> None:

@@ -9,12 +9,15 @@ import os
 import shutil
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
+from urllib.parse import quote
 
 import httpx
 import numpy as np
 import pytest
 from page_server import PageServer
 from store_helpers import fill, make_spec
+from waiting import until
 
 from acquire.capacity.load import Load, recording_spec
 from acquire.clock import ClockFit
@@ -99,11 +102,13 @@ def test_no_damage_is_answered_as_a_defect_of_the_server(tmp_path: Path) -> None
     with RecordingWriter.create(tmp_path / "whole.zarr", make_spec()) as writer:
         fill(writer, 150)
         writer.add_event("mark", 5, 1000, "here")
+        writer.add_gap("a", 1003, 1, "camera")
         writer.seal(RunCondition.GOOD, "done", {})
     damages: dict[str, Callable[[Path], object]] = {
         "lines": lambda path: _truncate(path / "a" / "lines" / "c" / "0" / "0"),
         "arm": lambda path: shutil.rmtree(path / "b"),
         "events": lambda path: _truncate(path / "events" / "text" / "c" / "0"),
+        "gaps": lambda path: _truncate(path / "gaps" / "count" / "c" / "0"),
         "root": lambda path: _truncate(path / "zarr.json"),
         "no-root": lambda path: (path / "zarr.json").unlink(),
         "text": lambda path: _set_config(path / "zarr.json", "x"),
@@ -134,11 +139,52 @@ def test_no_damage_is_answered_as_a_defect_of_the_server(tmp_path: Path) -> None
     assert all("message" in answer.json() for answer in answers.values() if answer.status_code != 200)
     assert len(listed) == len(damages) + 2
     # What can be shown is shown.
-    assert {codes[name, of] for name in ("lines", "arm", "text", "number") for of in ("", "/picture")} == {
-        200
-    }
+    shown = ("lines", "arm", "text", "number", "events", "gaps")
+    assert {codes[name, of] for name in shown for of in ("", "/picture")} == {200}
     assert "cut short" in listed["lines.zarr"]["damage"]
-    assert codes["events", ""] == codes["root", "/picture"] == codes["no-root", "/hold"] == 424
+    details = {name: answers[name, ""].json() for name in ("whole", "events", "gaps")}
+    assert "table events/text cannot be read" in details["events"]["damage"]
+    assert (details["events"]["events"], details["events"]["event_list"]) == (None, [])
+    assert details["events"]["lost_lines"] == details["whole"]["lost_lines"] == {"a": 1, "b": 0}
+    assert "table gaps/count cannot be read" in details["gaps"]["damage"]
+    assert (details["gaps"]["lost_lines"], details["gaps"]["events"]) == (None, 1)
+    assert codes["root", "/picture"] == codes["no-root", "/hold"] == 424
+
+
+def test_names_that_json_cannot_have_are_opened_as_they_are_listed(tmp_path: Path) -> None:
+    """They were listed with escapes, and under the names in the list nothing was found."""
+    with RecordingWriter.create(tmp_path / "x.zarr", make_spec()) as writer:
+        fill(writer, 150)
+        writer.seal(RunCondition.GOOD, "done", {})
+    odd = {"caf\\udce9.zarr": b"caf\xe9.zarr", "\\x1b[0m.zarr": b"\x1b[0m.zarr", "a\nb.zarr": b"a\nb.zarr"}
+    odd |= {"back\\slash.zarr": b"back\\slash.zarr", "a #?%20.zarr": b"a #?%20.zarr"}
+    for name in odd.values():
+        shutil.copytree(tmp_path / "x.zarr", os.fsdecode(os.fsencode(tmp_path) + b"/" + name))
+    cuts: dict[str, Any] = {}
+    with (
+        contextlib.closing(PageServer(tmp_path / "c.sock", tmp_path)) as page,
+        httpx.Client(
+            base_url=f"{page.address}api", headers={"Authorization": f"Bearer {page.operator}"}, timeout=60
+        ) as ask,
+    ):
+        assert {one["name"] for one in ask.get("/recordings").json()} == {"x.zarr", *odd}
+        for name in odd:
+            asked = f"/recordings/{quote(name, safe='')}"
+            assert ask.get(asked).json()["name"] == name
+            assert ask.get(f"{asked}/picture").content.startswith(b"\x89PNG")
+            job = {"kind": "cut", "recording": name, "first_line": 1000, "lines": 16}
+            assert ask.post("/jobs", json=job).status_code == 200
+
+        def done() -> bool:
+            found = {job["recording"]: job for job in ask.get("/jobs").json()}
+            cuts.update(found)
+            return {job["state"] for job in found.values()} <= {"done", "failed"}
+
+        until(done, "the jobs")
+        for name in odd:
+            assert cuts[name]["state"] == "done", cuts[name]
+            made = ask.get(f"/cuts/{quote(cuts[name]['result'], safe='')}")
+            assert made.content.startswith(b"PK")
 
 
 def test_the_first_list_is_made_before_anybody_asks(tmp_path: Path) -> None:

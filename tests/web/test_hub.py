@@ -48,6 +48,7 @@ def test_pages_get_the_same_message_and_fewer_pictures_during_a_recording(tmp_pa
             await client.start(tmp_path / "r.zarr")
             await until(lambda: hub.is_recording)
             assert b'"recording"' in hub.state_message()
+            assert b'"live_error":""' in hub.state_message()
             assert hub.state_message() is not first
             assert hub.live.turn_s == RECORDING_TURN_S
         finally:

@@ -24,6 +24,7 @@ from acquire.daemon.endpoint import Endpoint
 from acquire.daemon.messages import DiskStatus
 from acquire.daemon.service import Service
 from acquire.errors import CameraError
+from acquire.stream.ring import RingShape
 
 if TYPE_CHECKING:
     from playwright.sync_api import Browser, Page, Route
@@ -181,6 +182,23 @@ def test_a_loss_stays_until_it_is_acknowledged(page: Page, instrument: Instrumen
     assert page.inner_text("#lost") == "246"
     page.click("#acknowledge")
     page.wait_for_selector("body[data-state=idle][data-level=idle]", timeout=SEEN_MS)
+
+
+def test_the_reason_why_there_is_no_picture_is_shown_in_its_place(
+    page: Page, instrument: Instrument, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    shape = RingShape(slots=8, rows=4, width=8, dtype="uint16")
+    gone = {arm: (str(tmp_path / f"ring-{arm}"), shape) for arm in ("a", "b")}
+    monkeypatch.setattr(instrument.run, "ring_places", lambda: gone)
+    arm(instrument)
+    page.wait_for_selector("#arms p.none:has-text('No picture: the lines cannot be read')", timeout=SEEN_MS)
+    words = page.inner_text("#arms")
+    assert words.count("ring-a: No such file or directory") == 2, "of both arms: they are read together"
+    assert "run as the daemon's user" in words
+    page.goto(page.url.partition("#")[0] + "#/aim")
+    page.wait_for_selector("#aim-view p.none:has-text('No picture')", timeout=SEEN_MS)
+    instrument.client.disarm()
+    page.wait_for_selector("#aim-view p.none:has-text('No lines: arm the instrument')", timeout=SEEN_MS)
 
 
 def test_all_can_be_reached_and_done_by_key(page: Page, instrument: Instrument) -> None:

@@ -108,10 +108,12 @@ def check(plan: DemoPlan, rig: RigConfig) -> None:
             f"the demo cannot be written to {out}, which exists and is not overwritten",
             hint="--out with a new directory",
         )
-    if not out.absolute().parent.is_dir():
+    from acquire.store.files import no_directory
+
+    if (no := no_directory(out.absolute().parent)) is not None:
+        why, _ = no
         raise UsageError(
-            f"the demo cannot be written to {out}: there is no directory {out.absolute().parent}",
-            hint="--out in a directory that exists",
+            f"the demo cannot be written to {out}: {why}", hint="--out in a directory that exists"
         )
     for budget_s in (plan.budget_s, plan.twist_budget_s):
         if budget_s is not None and not budget_s > 0:

@@ -18,9 +18,10 @@ export class Aim {
     $("aim-reset").addEventListener("click", () => this.#forget());
   }
 
-  show(status) {
+  show(status, liveError) {
     if (status.run_id !== this.#run) { this.#run = status.run_id; if (status.run_id) this.#fall.clear(); }
-    this.#none.textContent = status.state === "idle" ? "No lines: arm the instrument." : "Waiting for lines.";
+    if (liveError) this.#fall.clear();
+    this.#none.textContent = liveError ? `No picture: ${liveError}` : status.state === "idle" ? "No lines: arm the instrument." : "Waiting for lines.";
     this.#none.hidden = !this.#fall.isEmpty;
     if (!$("aim").hidden) this.#draw();
   }

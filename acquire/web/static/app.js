@@ -57,8 +57,8 @@ link.addEventListener("rows", ({ detail }) => { watch.rows(detail.header, detail
 link.addEventListener("state", ({ detail }) => {
   latest = detail.header.state;
   band.show(latest.status, latest.health, latest.for_s);
-  watch.show(latest.status);
-  aim.show(latest.status);
+  watch.show(latest.status, latest.live_error);
+  aim.show(latest.status, latest.live_error);
   calibrate.show(latest.status);
   showHealth(latest.status, latest.health, fail, operator);
   if (!setup) admitted().catch(() => {});

@@ -44,11 +44,11 @@ export class Watch {
       make("time", { dateTime: one.time }, clock(one.time)), one.kind === "mark" && one.text !== "mark" ? `mark: ${one.text}` : one.text)));
   }
 
-  show(status) {
+  show(status, liveError) {
     this.#status = status; this.#unknown = "";
     this.#possible = new Set(status.busy ? [] : status.possible);
     this.#enable();
-    for (const [name, arm] of Object.entries(this.#arms)) arm.show(status.arms[name], status);
+    for (const [name, arm] of Object.entries(this.#arms)) arm.show(status.arms[name], status, liveError);
     this.#now(status);
     this.#ledger(status);
   }
@@ -156,10 +156,12 @@ class Arm {
 
   rows(header, body) { this.#fall.add(header, body); this.#histogram.add(header); this.#none.hidden = true; }
 
-  show(arm, status) {
+  show(arm, status, liveError) {
     if (status.run_id !== this.#run) { this.#run = status.run_id; if (status.run_id) { this.#fall.clear(); this.#histogram.clear(); } }
+    // The last picture must not stand there as if it were the newest.
+    if (liveError) this.#fall.clear();
     this.#none.hidden = !this.#fall.isEmpty;
-    this.#none.textContent = status.run_id ? "Waiting for lines." : "No lines: arm the instrument.";
+    this.#none.textContent = liveError ? `No picture: ${liveError}` : status.run_id ? "Waiting for lines." : "No lines: arm the instrument.";
     if (!arm) { this.#numbers.textContent = ""; return; }
     const verdict = arm.check ? `code ${arm.check.verdict.replaceAll("_", " ")}${arm.check.shift ? ` ${arm.check.shift > 0 ? "+" : ""}${arm.check.shift}` : ""}` : "code not checked";
     const text = `${quantity(arm.rate_hz, "lines/s")} · ring ${percent(arm.ring.fill / arm.ring.slots)} · ${verdict}`;
