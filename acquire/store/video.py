@@ -230,7 +230,10 @@ def open_video(place: Path | str) -> VideoFile:
     except (GroupNotFoundError, NotADirectoryError) as error:
         raise PlaceError(f"{source} is not a video: it is not a Zarr group", hint=_VIDEO) from error
     except DAMAGE as error:
-        raise DataError(f"{source} is not a video, or is damaged: {cause_in_words(error)}") from error
+        raise DataError(
+            f"{source} is not a video, or is damaged: {cause_in_words(error)}",
+            hint="a copy of the video, or acquire reconstruct once more",
+        ) from error
     return found
 
 
