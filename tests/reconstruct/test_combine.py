@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import multiprocessing
 import os
 import signal
 import subprocess
@@ -280,6 +281,26 @@ def test_a_failing_sub_segment_leaves_nothing(recording_path, request_of_three, 
     with pytest.raises(UsageError, match="solver"):
         run(recording_path, request_of_three, tmp_path / "v.zarr", Options(solver="magic"), workers=2)
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_to_all_processes_ends_none_of_those_that_are_still_starting(
+    recording_path, request_of_three, tmp_path, number
+):
+    """Ctrl-C, and the SIGTERM of `timeout`, reach them too: the command failed for lack of memory."""
+    told = set()
+
+    def stop():
+        for child in multiprocessing.active_children():
+            if child.pid not in told:  # a tenth of a second old
+                told.add(child.pid)
+                os.kill(child.pid, number)
+        return True
+
+    outcome = run(recording_path, request_of_three, tmp_path / "v.zarr", workers=2, stop=stop)
+    assert told
+    assert outcome.interrupted
+    assert open_video(tmp_path / "v.zarr").attrs["provenance"]["state"] == "interrupted"
 
 
 def test_ctrl_c_keeps_the_best_so_far(recording_path, tmp_path):
