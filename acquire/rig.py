@@ -47,7 +47,10 @@ class Rig:
             raise
         except Exception as error:  # somebody else's driver may fail in any way
             what = f"trigger driver {config.trigger.driver!r} failed to open"
-            raise TriggerError(f"{what}: {type(error).__name__}: {error}") from error
+            raise TriggerError(
+                f"{what}: {type(error).__name__}: {error}",
+                hint="its cable and options; else its author, by the distribution that acquire plugins names",
+            ) from error
 
     def openers(self) -> dict[str, CameraOpener]:
         """Return arm → opener of its camera, for use here or in a child process."""

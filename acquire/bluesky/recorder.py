@@ -139,7 +139,10 @@ class Recorder(Device, Stageable, Preparable, Flyable, Collectable, WritesStream
             status = await self._client.call(core.command("start", Status, self._request))
             recording = status.recording or status.last  # the latter if it has ended already
             if recording is None:
-                raise DeviceError(f"{self.name}: the daemon did not report the recording that it started")
+                raise DeviceError(
+                    f"{self.name}: the daemon did not report the recording that it started",
+                    hint="acquire status shows what the daemon does; then run the plan again",
+                )
             budget = status.recording.budget_lines if status.recording else self._request.lines
             self._account = Account(self.name, rig, recording.path, budget)
             # In a thread, as all looks at files: a network disk may hang, and the RunEngine's loop must not.
@@ -313,9 +316,15 @@ class Recorder(Device, Stageable, Preparable, Flyable, Collectable, WritesStream
             )
         condition, reason = attrs["run_condition"], attrs["end_reason"]
         if condition in (RunCondition.ABORTED, RunCondition.INTERRUPTED):
-            raise DeviceError(f"{self.name}: {path} is {condition}, {account.reach} lines: {reason}")
+            raise DeviceError(
+                f"{self.name}: {path} is {condition}, {account.reach} lines: {reason}",
+                hint="acquire verify lists the lines that it holds; check the cause, then run the plan again",
+            )
         if account.budget is not None and account.reach < account.budget:
-            raise DeviceError(f"{self.name}: {path} has {account.reach} of {account.budget} lines: {reason}")
+            raise DeviceError(
+                f"{self.name}: {path} has {account.reach} of {account.budget} lines: {reason}",
+                hint="acquire verify lists the lines that it holds; check the cause, then run the plan again",
+            )
         if len(account.uncovered) > 1:
             paths = ", ".join(str(segment.path) for segment in account.uncovered)
             raise DeviceError(

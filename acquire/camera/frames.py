@@ -139,7 +139,8 @@ class FrameCount:
             if self._stale > _MOST_STALE:
                 raise CameraLostError(
                     f"the camera has restarted its count: after id {self._last_id}, {self._stale} frames "
-                    f"with lower ids came, the last one {frame.frame_id}"
+                    f"with lower ids came, the last one {frame.frame_id}",
+                    hint="check its power supply, then arm again",
                 )
             return None
         self._stale = 0

@@ -64,7 +64,11 @@ class LiveCamera:
             return message.of
         # Last: a process that has died may have sent readings, or its error, before.
         if self._worker.death is not None:
-            raise CameraError(f"{self._worker.name}: its process has ended: {self._worker.death}")
+            raise CameraError(
+                f"{self._worker.name}: its process has ended: {self._worker.death}",
+                hint="open the camera again; if it happens again, look for what ended it in the "
+                "kernel's log (memory, or the camera's library)",
+            )
         return {}
 
     def close(self) -> None:

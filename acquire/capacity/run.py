@@ -151,9 +151,15 @@ def _measure(
 def _check(status: CaptureStatus, ends_s: float) -> None:
     """Raise DataError if the capture has a fault or the recording does not end in time."""
     if status.fault is not None:
-        raise DataError(f"the load could not be sustained: {status.fault}")
+        raise DataError(
+            f"the load could not be sustained: {status.fault}",
+            hint="a lower line rate, or fewer other programs on this host",
+        )
     if time.monotonic() > ends_s + _GRACE_S:
-        raise DataError(f"the load's recording did not end within {_GRACE_S:g} s of its scheduled end")
+        raise DataError(
+            f"the load's recording did not end within {_GRACE_S:g} s of its scheduled end",
+            hint="a disk that keeps up with the lines (--out), or a lower line rate",
+        )
 
 
 def _unaccounted(arm: dict[str, Any]) -> int:
@@ -207,5 +213,9 @@ def _cpu_s(pids: dict[str, int | None]) -> dict[str, float]:
             # The kernel's clock id for another process's time, as computed by clock_getcpuclockid(3).
             used_s[name] = time.clock_gettime((~(pid or os.getpid()) << 3) | 2)
         except OSError as error:
-            raise DataError(f"the load could not be sustained: process {name} ended") from error
+            raise DataError(
+                f"the load could not be sustained: process {name} ended",
+                hint="fewer other programs on this host, or more memory; the kernel's log tells what "
+                "it ended",
+            ) from error
     return used_s

@@ -72,23 +72,30 @@ def _carry_out() -> int:
     except ModuleNotFoundError as error:
         return _failed(not_installed(error))
     except OSError as error:
-        full = _is_full(sys.stdout)
-        # As other programs end in `acquire ls | head`.
-        if error.errno == errno.EPIPE:
-            return 1
-        where = error.filename or ("standard output" if full else "")
-        kind = DeviceError if error.errno in HOST_ERRORS else UsageError
-        return _failed(kind(f"{where}: {error.strerror or error}".removeprefix(": ")))
+        return _refused_by_the_system(error)
     # Without a message: `interrupts_handled` has acknowledged it.
     except KeyboardInterrupt:
         return EXIT_INTERRUPTED
     # A defect: with its traceback, and with the name of whoever can mend it, if that is not us.
     except Exception as error:
+        # In the body of a class, Python before 3.12 makes a RuntimeError of Ctrl-C, as during imports.
+        if isinstance(error.__cause__, KeyboardInterrupt):
+            return EXIT_INTERRUPTED
         from acquire.plugins import raised_by
 
         if module := raised_by(error):
             error.add_note(f"This error arose in a plug-in: {module}.")
         raise
+
+
+def _refused_by_the_system(error: OSError) -> int:
+    full = _is_full(sys.stdout)
+    # As other programs end in `acquire ls | head`.
+    if error.errno == errno.EPIPE:
+        return 1
+    where = error.filename or ("standard output" if full else "")
+    kind = DeviceError if error.errno in HOST_ERRORS else UsageError
+    return _failed(kind(f"{where}: {error.strerror or error}".removeprefix(": ")))
 
 
 def _is_full(stream: TextIO) -> bool:

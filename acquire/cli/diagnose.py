@@ -42,11 +42,11 @@ def diagnose(
     """Check a recording's lines against its code, geometry and orientation, and report what is wrong.
 
     The hypotheses are: the code is inverted, shifted by sub-steps or lines, or belongs to another run; the
-    arms are swapped or mirrored; the number of sub-steps per line differs; an arm is stuck; the black level,
-    ambient light or gains are wrong; there is too little light. For each hypothesis the table shows the gain
-    in log likelihood over the recording's description, that gain in standard errors, and how many times
-    better the arms agree than under wrong codes. The exit code is 1 if something is wrong. Behind a fibre one
-    tile is tested: the one given, or the one whose lines have the most contrast.
+    arms are swapped or mirrored; the number of sub-steps per line differs; an arm is stuck or dark; the black
+    level, ambient light or gains are wrong; there is too little light. For each hypothesis the table shows
+    the gain in log likelihood over the recording's description, that gain in standard errors, and how many
+    times better the arms agree than under wrong codes. The exit code is 1 if something is wrong. Behind a
+    fibre one tile is tested: the one given, or the one whose lines have the most contrast.
 
     Example: [bold]acquire diagnose run.zarr[/]
     """
@@ -72,7 +72,11 @@ def diagnose(
                 "lines": f"{first} to {first + count - 1}",
                 **whose,
                 "verdict": f"{found.standing}: {found.sentence}",
-                **{f"also ({each.kind})": each.words for each in found.suspicions},
+                # Both arms may give rise to the same one.
+                **{
+                    f"also ({kind})": "; ".join(each.words for each in found.suspicions if each.kind == kind)
+                    for kind in dict.fromkeys(each.kind for each in found.suspicions)
+                },
             }
         )
         rows = [

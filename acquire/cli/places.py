@@ -63,12 +63,19 @@ def private_directory() -> Iterator[Path]:
 @contextlib.contextmanager
 def new_directory(path: Path) -> Iterator[None]:
     """Create the output directory of a command; it is removed again if the command leaves it empty."""
-    from acquire.store.files import check_new_path
-
-    check_new_path(path)
-    path.mkdir()
+    make_directory(path)
     try:
         yield
     finally:
         with contextlib.suppress(OSError):  # raised if it is not empty
             path.rmdir()
+
+
+def make_directory(path: Path) -> None:
+    """Create a directory. Raises UsageError if it exists, and what `refused` raises if that is impossible."""
+    from acquire.store.files import check_new_path
+    from acquire.store.refusals import refused
+
+    check_new_path(path)
+    with refused(path, "created"):
+        path.mkdir()

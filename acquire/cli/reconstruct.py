@@ -330,15 +330,32 @@ def _voxels(
 def _new_places(out: str, names: list[str]) -> list[str]:
     """Return the place of each video: NAME.zarr, or one of several, NAME-1x820.zarr.
 
-    Raises UsageError if one exists.
+    Raises UsageError if one exists, or if the name is that of a file in another format.
     """
     from acquire.store.delivery import check_new_place
 
     stem = out.rstrip("/")
+    _check_suffix(stem)
     places = [re.sub(r"(\.[^./]*)?$", rf"-{name}\1", stem, count=1) if name else out for name in names]
     for place in places:
         check_new_place(place)
     return places
+
+
+def _check_suffix(out: str) -> None:
+    """Raise UsageError for a name under which other programs would expect a file: NAME.mp4, NAME.tif."""
+    suffix = PurePosixPath(out).suffix.lower()
+    if suffix in ("", ".zarr"):
+        return
+    from acquire.evaluate.rendering import SUFFIXES as RENDERED
+    from acquire.exchange.export import SUFFIXES as EXPORTED
+
+    if suffix in {*RENDERED, *EXPORTED}:
+        raise UsageError(
+            f"a video of reconstruct is an OME-Zarr directory, and not {suffix}",
+            possible=f"--out {PurePosixPath(out).with_suffix('.zarr')}",
+            hint="acquire export or acquire render, which make such files of it",
+        )
 
 
 def _make(

@@ -111,7 +111,9 @@ def prepare(recording: Recording, arguments: Arguments) -> Prepared:
         grids = [request.grid for request in requests.values()]
         # The whole work has to fit the limit: all videos, and all tiles of each.
         tiles = max(1, *(len(request.tiles) for request in requests.values()))
-        choice = choose(known, options.budget_s, tiles * sum(grid.frames * grid.side**2 for grid in grids))
+        voxels = tiles * sum(grid.frames * grid.side**2 for grid in grids)
+        sizes = {(grid.voxels.spatial_merge, grid.voxels.temporal_merge) for grid in grids}
+        choice = choose(known, options.budget_s, voxels, sizes.pop() if len(sizes) == 1 else None)
     options = replace(options, preset=choice.preset or options.preset)  # type: ignore[arg-type]  # checked when it is used
     return replace(prepared, options=options, learned=choice.why)
 

@@ -94,7 +94,10 @@ def load(
         facts["load_ms"] = round((time.monotonic() - begun_s) * 1000, 1)
         # The device's CRC has covered its memory, but not what a host reads from it.
         if (device.read_code(len(bits)) != bits).any():
-            raise TriggerError("the code memory reads back differently from what was loaded")
+            raise TriggerError(
+                "the code memory reads back differently from what was loaded",
+                hint="acquire trigger load once more, then acquire trigger selftest",
+            )
     if json:
         print_json(facts)
         return
@@ -186,7 +189,10 @@ def selftest(
     failed = [name.removesuffix("_failed") for name, bit in result.items() if name != "done" and bit]
     # A self-test that was not run has found nothing wrong, either.
     if failed or not result["done"]:
-        raise TriggerError(f"the self-test failed: {', '.join(failed) or 'it was not run'}")
+        raise TriggerError(
+            f"the self-test failed: {', '.join(failed) or 'it was not run'}",
+            hint="load its bitstream again, or power it off and on; if it fails again, replace the board",
+        )
     if json:
         print_json({"passed": True})
         return

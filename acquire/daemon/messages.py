@@ -418,3 +418,9 @@ def fault_error(fault: str | None) -> DeviceError:
 
 def error_body(error: AcquireError) -> dict[str, Any]:
     return ErrorMessage.of(error).model_dump(mode="json")
+
+
+def release_error(error: OSError) -> DeviceError:
+    """Return the error of a run whose devices were not closed in order."""
+    what = f"the devices could not be released in order: {error}"
+    return DeviceError(what, hint="acquire devices shows whether each can be opened again")

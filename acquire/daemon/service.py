@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING
 from acquire import __version__
 from acquire.daemon.disk_watch import disk_watch
 from acquire.daemon.events import StandingOrder
-from acquire.daemon.messages import ArmRequest, LastRecording, Status, fault_error
+from acquire.daemon.messages import ArmRequest, LastRecording, Status, fault_error, release_error
 from acquire.daemon.news import NewsLog
 from acquire.daemon.plan import default_path, recording_of
 from acquire.daemon.report import Rates, arm_statuses, seconds_since, trigger_status
@@ -27,7 +27,7 @@ from acquire.daemon.states import Event, State, after, commands, possible
 from acquire.daemon.take import Take
 from acquire.daemon.troubles import Troubles
 from acquire.daemon.uploads import Uploads
-from acquire.errors import AcquireError, DeviceError, StateError, UsageError
+from acquire.errors import AcquireError, StateError, UsageError
 from acquire.logs import EACH
 from acquire.store import RunCondition
 from acquire.stream import Begin, CaptureStatus, Note
@@ -402,7 +402,7 @@ class Service:
         try:
             run.capture.close()
         except OSError as error:
-            raise DeviceError(f"the devices could not be released in order: {error}") from error
+            raise release_error(error) from error
         finally:
             self._seen, self._rates = run.capture.poll(), Rates()
             self._salvage.add(self._seen.orphans)

@@ -65,7 +65,10 @@ def choose_for(
     try:
         return choose_codec(sample, needed, measure_disk(directory))
     except OSError as error:
-        raise DataError(f"the disk of {directory} cannot be measured: {error.strerror}") from error
+        raise DataError(
+            f"the disk of {directory} cannot be measured: {error.strerror}",
+            hint="[recording] directory on another disk, or its permissions",
+        ) from error
 
 
 def shot_noise(config: RigConfig) -> NDArray[Any]:

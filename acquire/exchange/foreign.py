@@ -104,9 +104,15 @@ class LineFile:
         try:
             found = np.asarray(self.read(arm, start, stop))
         except MALFORMED as error:
-            raise DataError(f"{self.path}: lines {start} to {stop - 1} cannot be read: {error}") from error
+            raise DataError(
+                f"{self.path}: lines {start} to {stop - 1} cannot be read: {error}",
+                hint="a complete copy of the file, or lines before these",
+            ) from error
         if found.shape != (stop - start, self.pixels):
-            raise DataError(f"{self.path} ends before line {stop}: it was cut short")
+            raise DataError(
+                f"{self.path} ends before line {stop}: it was cut short",
+                hint="a complete copy of the file, or fewer --lines",
+            )
         return found.astype(self.dtype.newbyteorder("="), copy=False)
 
 

@@ -168,6 +168,9 @@ def _frames(array: zarr.Array[Any], kept: range, what: str) -> Iterator[Block]:
         try:
             values = np.asarray(array[start:stop])
         except DAMAGE as error:
-            raise DataError(f"{what} {start} to {stop - 1} of the video cannot be read: {error}") from error
+            raise DataError(
+                f"{what} {start} to {stop - 1} of the video cannot be read: {error}",
+                hint="a copy of the video, or acquire reconstruct once more",
+            ) from error
         yield block((slice(start - kept.start, stop - kept.start),), values)
         start = stop

@@ -97,7 +97,10 @@ class Worker:
             self._child = nursery().fork(name, _main, theirs, name, target, *args)
         except (OSError, pickle.PicklingError, AttributeError, TypeError) as error:
             self.pipe.close()
-            raise DeviceError(f"{name}: the process cannot be started: {error}") from error
+            raise DeviceError(
+                f"{name}: the process cannot be started: {error}",
+                hint="fewer other programs on this host, or more memory",
+            ) from error
         finally:
             theirs.close()  # otherwise the pipe would not end with the child
 
@@ -178,7 +181,13 @@ class Worker:
             return message
         # A process that dies closes its pipe a moment before its exit code is available.
         self._child.exit_code(_LAST_WORD_S if message is None else 0.0)
-        raise DeviceError(f"{self.name}: {self.death or 'it did not answer in time'}")
+        if self.death is None:
+            raise DeviceError(
+                f"{self.name}: it did not answer in time", hint="again, on a host that is less busy"
+            )
+        raise DeviceError(
+            f"{self.name}: {self.death}", hint="look into the log of this program, and the kernel's"
+        )
 
     def end(self, deadline: float) -> None:
         """End the process: by `Quit` until the monotonic ``deadline``, then by force. Idempotent.
@@ -210,7 +219,10 @@ class Worker:
             )
         self._child.close()
         if forced:
-            raise DeviceError(f"{self.name}: the process did not end when told to, and was killed")
+            raise DeviceError(
+                f"{self.name}: the process did not end when told to, and was killed",
+                hint="acquire devices shows whether its device answers; what it had not written yet is lost",
+            )
 
 
 def _main(pipe: Connection[Any, Any], name: str, target: Callable[..., None], *args: Any) -> None:

@@ -10,7 +10,7 @@ import numpy as np
 from acquire.cores import limit_threads
 from acquire.recon.balance import balance_of
 from acquire.recon.hypotheses import Hypothesis, LineModel, Turn
-from acquire.recon.sanity import Suspicion, black_level_off, suspicions, unusable
+from acquire.recon.sanity import Suspicion, black_level_off, dark, suspicions, unusable
 from acquire.recon.search import Candidate, Inquiry, Standing, advantage, inquire
 
 if TYPE_CHECKING:
@@ -91,7 +91,7 @@ def diagnose(segment: Segment, bits: Callable[[int, int], NDArray[np.uint8]] | N
 
     ``bits(start, length)`` returns the code from the segment's first bit on, also beyond the segment.
     """
-    nothing = unusable(segment)
+    nothing = [*unusable(segment), *dark(segment)]
     if nothing:
         return Diagnosis(Standing.UNCLEAR, "the lines cannot be compared with their code", (), tuple(nothing))
     if segment.geometry.lines < FEWEST_DIAGNOSED or segment.geometry.stages < FEWEST_STAGES:

@@ -198,7 +198,11 @@ def build_problem(
     bad = outliers(samples, segment.mask)
     usable = segment.mask & ~np.logical_or.reduce([np.zeros_like(segment.mask), *bad.values()])
     if not usable.any():
-        raise UsageError("no sample of the segment is usable", hint="try another range of lines")
+        first, last = segment.first_line, segment.first_line + segment.geometry.lines - 1
+        raise UsageError(
+            f"no sample of lines {first} to {last} is usable: all are lost, saturated or far from the others",
+            possible="lines before them, or after them; acquire info lists what is lost",
+        )
     operator = DualArm(
         segment.geometry,
         segment.code,

@@ -70,6 +70,16 @@ def unusable(segment: Segment) -> list[Suspicion]:
     return found
 
 
+def dark(segment: Segment) -> list[Suspicion]:
+    """Find arms that saw no light at all: none of their usable samples is above the black level."""
+    words = "no sample is above its black level, so that no light reached it, or the black level is too high"
+    return [
+        Suspicion("dark", f"arm {arm} is dark: {words}")
+        for arm, lines, mask in zip("ab", segment.samples(np.float64), segment.mask, strict=True)
+        if mask.any() and lines[mask].max() <= 0
+    ]
+
+
 def black_level_off(segment: Segment) -> list[Suspicion]:
     """Find arms whose unlit columns share one constant value that is not 0, as it should be."""
     found = []

@@ -113,9 +113,9 @@ class Stream:
             end = min(end, geometry.span)
         if end <= begin:
             raise UsageError(
-                f"no voxel of {last.temporal_merge} sub-steps is sampled in full by {geometry.lines} lines",
-                possible=f"more than {self.stages} lines and a shorter T_m",
-                hint="or keep the voxels that are sampled only in part (whole ends)",
+                f"no voxel of T_m = {last.temporal_merge} is sampled in full by L_R = {geometry.lines}",
+                possible=f"more than {self.stages} lines; the shorter T_m, the fewer are needed",
+                hint="--ends whole, which also keeps voxels that are sampled only in part",
             )
         return origin + begin, origin + end
 

@@ -6,8 +6,9 @@
     combine   VideoRequest ──▶ sub-segments ──▶ pool ──▶ stitched in order ──▶ video
     pools     where sub-segments are solved: in this process, in others, on a cluster
     work      one sub-segment: cut, solve, resample to the grid
+    facts     what is recorded of its result, and whether it is trusted
     sheet     its frames in the video: in a row, or behind a fibre tile by tile
-    single    a reconstruction that is already in memory, made by `reconstruct` (of `acquire.recon`)
+    single    a reconstruction that is already in memory, made by `acquire.recon.reconstruct`
 
     before    propose (voxels by the tempo), budget and learned (time), explain and arms (calibration),
               diagnose and reorient (description), liveliest (the tile to try them on)

@@ -15,7 +15,7 @@ import numpy as np
 
 from acquire import __version__
 from acquire.calibrate.choose import provenance
-from acquire.errors import AcquireError
+from acquire.errors import AcquireError, UsageError
 from acquire.plugins import DENOISERS, SOLVERS, of_others
 from acquire.recon.diagnosis import TURNED
 from acquire.recon.error import combined_facts
@@ -93,10 +93,12 @@ def combine(
     ``out`` is a new path or URL. Behind a fibre the tiles of the scene are solved one after the other. If the
     watcher requests a stop, the part solved so far is written and marked as interrupted. A DataError, or
     whatever a sub-segment raises, leaves nothing behind. The options' budget is wall time from ``began``
-    (`time.monotonic`; the call if None) to the end of the video. Raises UsageError if it cannot be kept.
+    (`time.monotonic`; the call if None) to the end of the video. Raises UsageError if it cannot be kept, and
+    if both arms have lost all lines of a sub-segment, before anything is computed.
     """
     called, grid = time.monotonic(), request.grid
     segments = request.sub_segments()
+    _refuse_lost(recording, segments)
     location = str(recording) if is_url(str(recording)) else str(recording.path.resolve())
     balance, balance_facts, warnings = balance_of_recording(recording, options)
     options = replace(options, balance=balance)
@@ -137,6 +139,26 @@ def combine(
         facts["trusted"] = _trusted_frames(request, sheet.frames, trusted)
         sheet.finish(facts)
     return Outcome(out, (sheet.frames, *sheet.shape), watcher.stopped, facts, cut)
+
+
+def _refuse_lost(recording: Recording, segments: Sequence[SubSegment]) -> None:
+    """Raise UsageError if the gaps of both arms hold all lines of one of the sub-segments."""
+    begins = np.array([each.first_line - recording.first_line for each in segments])
+    ends = begins + np.array([each.lines for each in segments])
+    lost = np.ones(len(segments), bool)
+    for arm in recording.arms:
+        gaps = sorted(recording.lost_rows(arm), key=lambda rows: rows.start)
+        # Lines lost before each edge of a gap; in between their number grows with the lines, or not at all.
+        edges = [edge for rows in gaps for edge in (rows.start, rows.stop)] or [0]
+        before = np.cumsum([0, *(count for rows in gaps for count in (len(rows), 0))])[: len(edges)]
+        lost &= np.interp(ends, edges, before) - np.interp(begins, edges, before) >= ends - begins - 0.5
+    if lost.any():
+        number = int(np.argmax(lost))
+        first, lines = segments[number].first_line, segments[number].lines
+        raise UsageError(
+            f"no video can be made of lines {first} to {first + lines - 1}: both arms have lost all of them",
+            possible="lines before them, or after them; acquire info lists what is lost",
+        )
 
 
 def _solved(

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import json
 import os
+import secrets
 from collections import defaultdict
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -54,18 +55,24 @@ def learned_path() -> Path:
 
 
 def remember(found: Iterable[Learned], path: Path | None = None) -> Path:
-    """Add results to the file; they replace earlier ones of the same case."""
+    """Add results to the file; they replace earlier ones of the same case.
+
+    Raises OSError if the disk refuses, and leaves the file as it was.
+    """
     path = path or learned_path()
     known = {
         (each.solver, each.preset, each.spatial_merge, each.temporal_merge, each.voxels, each.scene): each
         for each in [*recall(path), *found]
     }
     path.parent.mkdir(parents=True, exist_ok=True)
-    # It is renamed when complete: a program that reads meanwhile finds the old file or the new one.
-    part = path.with_name(f".{path.name}.{os.getpid()}")
     document = {"version": VERSION, "learned": [asdict(each) for each in known.values()]}
-    part.write_text(json.dumps(document, indent=1) + "\n", encoding="utf-8")
-    part.replace(path)
+    # It is renamed when complete: a program that reads meanwhile finds the old file or the new one.
+    part = path.with_name(f".{path.name}.{secrets.token_hex(4)}.partial")
+    try:
+        part.write_text(json.dumps(document, indent=1) + "\n", encoding="utf-8")
+        part.replace(path)
+    finally:
+        part.unlink(missing_ok=True)  # what a full disk has left
     return path
 
 
@@ -79,20 +86,30 @@ def recall(path: Path | None = None) -> list[Learned]:
         return []
 
 
-def choose(known: Sequence[Learned], budget_s: float, voxels: int) -> Choice:
+def choose(
+    known: Sequence[Learned], budget_s: float, voxels: int, merges: tuple[int, int] | None = None
+) -> Choice:
     """Choose the best preset on average, among those that end within ``budget_s`` for ``voxels`` voxels.
 
-    ``known`` is of one solver. Times are scaled from the nearest size. Presets are compared on the scenes
-    that all of them were tried on.
+    ``known`` is of one solver. Times are scaled from those of the nearest number of voxels; if voxels of
+    different sizes (N_m, T_m) were as many, from those of the size ``merges`` or, without results of that
+    size, of the one tried on most scenes. Presets are compared on the scenes that all of them were tried on.
     """
     if not known:
         return Choice(None, "no preset was tried yet: run acquire tradeoff with several scenes")
     nearest = min(known, key=lambda each: abs(each.voxels - voxels)).voxels
-    by_preset: dict[str, dict[str, Learned]] = defaultdict(dict)
+    by_merges: dict[tuple[int, int], dict[str, dict[str, Learned]]] = defaultdict(lambda: defaultdict(dict))
     for each in known:
         if each.voxels == nearest:
-            by_preset[each.preset][each.scene] = each
-    scenes = sorted(set.intersection(*(set(each) for each in by_preset.values())))
+            tried_in = by_merges[each.spatial_merge, each.temporal_merge]
+            tried_in[each.preset][each.scene] = each
+    scenes_of = {
+        sizes: sorted(set.intersection(*(set(each) for each in presets.values())))
+        for sizes, presets in by_merges.items()
+    }
+    # Never a mixture: the same scene is easier in some voxels than in others, and takes another time.
+    sizes = max(scenes_of, key=lambda each: (each == merges, len(scenes_of[each])))
+    by_preset, scenes = by_merges[sizes], scenes_of[sizes]
     if len(scenes) < FEWEST_SCENES:
         tried = f"{len(scenes)} scene{'' if len(scenes) == 1 else 's'}"
         names = ", ".join(scenes) or "none in common"

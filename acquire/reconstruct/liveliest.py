@@ -78,13 +78,16 @@ def liveliest(
 def energies(segment: Segment) -> tuple[float, float]:
     """Return the variance of a segment's lines, and that of their residual to a scene at rest.
 
-    The variance of the noise is subtracted from both. They are 0 if no more than that remains, or if there
-    are too few lines.
+    The variance of the noise is subtracted from both. They are means of those arms that have enough complete
+    lines for them, so that a tile that lacks an arm's lines is comparable to others. They are 0 if no more
+    than the noise remains, or if there are too few lines.
     """
     geometry, samples = segment.geometry, segment.samples(np.float64)
     variance = segment.variance()
     unknowns = geometry.size + geometry.substeps - 1
-    contrast, residual, noise = 0.0, 0.0, 0.0
+    # (energy, variance of the noise) of each arm: of its lines, and of their residual
+    contrasts: list[tuple[float, float]] = []
+    residuals: list[tuple[float, float]] = []
     # (line, unknown): the code that exposed each line, sub-step by sub-step. It is a view, because windows
     # that are S steps apart overlap in nearly all of their bits.
     windows = np.lib.stride_tricks.sliding_window_view(segment.code, unknowns)
@@ -96,13 +99,20 @@ def energies(segment: Segment) -> tuple[float, float]:
         good = lines[np.ix_(rows, pixels)]
         if not good.size:
             continue
-        contrast += float(good.var(axis=0).mean())
-        if variance is not None:
-            noise += float(variance[arm][np.ix_(rows, pixels)].mean())
+        noise = 0.0 if variance is None else float(variance[arm][np.ix_(rows, pixels)].mean())
+        contrasts.append((float(good.var(axis=0).mean()), noise))
         if len(good) > SPARE_LINES * unknowns:
             fitted, *_ = np.linalg.lstsq(design[rows], good, rcond=None)
             unexplained = good - design[rows] @ fitted
             # The energy is per degree of freedom: noise alone gives its variance.
-            residual += float(np.square(unexplained).sum() / ((len(good) - unknowns) * good.shape[1]))
-    change = residual - noise
-    return max(0.0, contrast - noise), change if change > MOVES * noise else 0.0
+            energy = float(np.square(unexplained).sum() / ((len(good) - unknowns) * good.shape[1]))
+            residuals.append((energy, noise))
+    return _beyond_noise(contrasts), _beyond_noise(residuals, MOVES)
+
+
+def _beyond_noise(of_arms: list[tuple[float, float]], least: float = 0.0) -> float:
+    """Return the mean energy beyond the noise of the arms in a list, or 0 unless it exceeds a share of it."""
+    if not of_arms:
+        return 0.0
+    energy, noise = np.mean(of_arms, axis=0)
+    return float(energy - noise) if energy - noise > least * noise else 0.0

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import asyncio
 import multiprocessing
+import os
 import signal
 import threading
 from concurrent.futures import Future, ProcessPoolExecutor
@@ -22,6 +23,10 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
 SCHEDULER_TIMEOUT_S = 10
+FOR_ALL = (signal.SIGINT, signal.SIGHUP, signal.SIGTERM)
+"""Signals that reach all processes of a command at once."""
+GRACE_S = 30.0
+"""Time after SIGTERM in which a process can hand over its best result."""
 STEPS_PER_TASK = 200
 """Resolution of the progress of a task in another process."""
 
@@ -77,7 +82,9 @@ class Processes:
         self.workers, self._executor, self._shared = workers, executor, shared
 
     def submit(self, task: Task) -> Future[Part]:
-        return self._executor.submit(_solve_in_worker, task)
+        # A process may be started by this, which takes seconds.
+        with _interrupts_blocked():
+            return self._executor.submit(_solve_in_worker, task)
 
     def share_done(self) -> float:
         return self._shared.done
@@ -219,6 +226,19 @@ def _cluster(address: str) -> Iterator[Cluster]:
         yield Cluster(client)
 
 
+@contextmanager
+def _interrupts_blocked() -> Iterator[None]:
+    """Hold back Ctrl-C, also in a process that is started meanwhile: it inherits this, see `_begin_worker`.
+
+    Otherwise a Ctrl-C during its start would end it, and the work of all of them would count as failed.
+    """
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, FOR_ALL)
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
 _worker: _Shared | None = None
 
 
@@ -227,13 +247,24 @@ def _begin_worker(shared: _Shared, threads: int) -> None:
     global _worker  # noqa: PLW0603  # the only place for the state that a worker process gets at its start
     import numba
 
-    # A terminal sends Ctrl-C, and its end, to all of its processes; the parent asks this one to stop.
+    # A terminal sends Ctrl-C, and its end, to all of its processes; `timeout` and batch systems send SIGTERM.
+    # The parent, which gets it as well, asks this one to stop.
     for number in (signal.SIGINT, signal.SIGHUP):
         signal.signal(number, signal.SIG_IGN)
+    signal.signal(signal.SIGTERM, _end_later)
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, FOR_ALL)
     # Numba refuses more threads than it was started with.
     numba.set_num_threads(min(threads, numba.get_num_threads()))
     limit_blas(threads)
     _worker = shared
+
+
+def _end_later(_number: int, _frame: object) -> None:
+    """End this process in a while, unless the parent has had it ended by then."""
+    # A daemon thread, which does not keep a process that ends by itself.
+    timer = threading.Timer(GRACE_S, os._exit, (1,))
+    timer.daemon = True
+    timer.start()
 
 
 def _solve_in_worker(task: Task) -> Part:

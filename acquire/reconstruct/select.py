@@ -52,6 +52,12 @@ class Selection:
         """
         low, high = self.stream.extent(first, last, whole=whole)
         begin, end = low if self.begin is None else self.begin, high if self.end is None else self.end
+        if self.begin is not None and self.end is not None and end <= begin:
+            raise UsageError(
+                f"a range from {self.times.words(begin)} to {self.times.words(end)} is empty: it has to end "
+                "after its beginning",
+                possible=f"within {self.in_words(low, high)}",
+            )
         if not low <= begin < end <= high:
             raise UsageError(
                 f"the lines do not show {self.in_words(begin, end)} after the first line",

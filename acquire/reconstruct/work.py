@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import time
-from dataclasses import asdict, dataclass, field, fields, replace
+from dataclasses import dataclass, field, fields, replace
 from inspect import signature
 from typing import TYPE_CHECKING, Any, Protocol
-
-import numpy as np
 
 from acquire.calibrate import calibrated
 from acquire.calibrate.apply import aligned
@@ -15,22 +13,23 @@ from acquire.plugins import SOLVERS
 from acquire.recon import reconstruct
 from acquire.recon.balance import divided
 from acquire.recon.diagnosis import undo_turn
-from acquire.recon.error import error_facts, regions_of
+from acquire.recon.error import regions_of
 from acquire.recon.hypotheses import AS_BUILT
-from acquire.recon.judge import POOR_MISFIT
 from acquire.recon.reuse import Choice
+from acquire.reconstruct.facts import result_facts, why_not_trusted
 from acquire.store import open_recording
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
+    import numpy as np
     from numpy.typing import NDArray
 
     from acquire.arrays import Dtype
     from acquire.calibrate import Calibration
     from acquire.fibre import Tile
     from acquire.lines import Segment
-    from acquire.recon import Preset, Progress, Reconstruction
+    from acquire.recon import Preset, Progress
     from acquire.recon.balance import Balance
     from acquire.recon.hypotheses import Turn
     from acquire.recon.segments import Grid, SubSegment
@@ -165,36 +164,25 @@ def solve(task: Task, watch: Watch) -> Part:
     # The rest is reported: an early end leaves part of the iterations undone.
     watch.advance(1 - done)
     substeps = lines.geometry.substeps
-    doubt = _why_not_trusted(result, segment)
+    last = segment.first_line + segment.lines - 1
+    doubt = why_not_trusted(result, f"the sub-segment of lines {segment.first_line} to {last}")
     prefix = "" if task.tile is None else f"tile {task.tile}: "
     return Part(
         video=task.grid.resample(result.video, segment, substeps),
         quality=task.grid.resample_time(result.frame_error, segment, substeps),
         error=task.grid.resample_time(regions_of(result.error, len(result.video)), segment, substeps),
         facts={
+            **result_facts(result),
             "first_line": segment.first_line,
             "lines": segment.lines,
             "begin_substep": segment.begin,
             "end_substep": segment.end,
             "spatial_merge": voxels.spatial_merge,
             "temporal_merge": voxels.temporal_merge,
-            "iterations": result.iterations,
-            "iterations_asked": result.iterations_asked,
-            "ended": result.ended,
-            "seconds": round(result.seconds, 3),
-            "processor_s": round(result.processor_s, 3),
-            "compiled_s": round(result.compiled_s, 3),
-            "masked": result.masked,
             "trusted": doubt is None,
             "tile": None if task.tile is None else str(task.tile),
             "kept_choice": None if task.choice is None else task.choice.kept(result.parameters),
             "warnings": [prefix + text for text in (*([] if doubt is None else [doubt]), *result.warnings)],
-            "parameters": result.parameters,
-            "error": error_facts(result.error),
-            "quality": {  # JSON has no NaN
-                name: None if isinstance(value, float) and not np.isfinite(value) else value
-                for name, value in asdict(result.quality).items()
-            },
         },
         # A search that was stopped has not chosen.
         choice=Choice.of(result) if result.believed and result.ended != "stopped" else None,
@@ -210,19 +198,3 @@ def as_read(lines: Segment, options: Options) -> Segment:
         return calibrated(lines, known)
     # the alignment is that of the arms after the turn, which may exchange them
     return aligned(undo_turn(calibrated(lines, replace(known, alignment=None)), turn), known.alignment)
-
-
-def _why_not_trusted(result: Reconstruction, segment: SubSegment) -> str | None:
-    """Return why no frame is trusted, or None: the run was stopped, or too short to explain its lines."""
-    if not result.believed:
-        return "no frame of it is trusted: the lines contradict the recording's description of them"
-    # A run ended by its budget is trusted if it explains its lines; one that was stopped never is.
-    missed = float(np.nanmax([result.quality.misfit, result.quality.prediction]))
-    if result.ended != "stopped" and (result.ended != "budget" or missed <= POOR_MISFIT):
-        return None
-    ended = "stopped" if result.ended == "stopped" else "ended by its budget"
-    last = segment.first_line + segment.lines - 1
-    return (
-        f"the sub-segment of lines {segment.first_line} to {last} was {ended} after {result.iterations} "
-        f"iterations and leaves a misfit of {missed:.0%}: it is not trusted"
-    )

@@ -279,7 +279,10 @@ class Wire:
                 train, now_ns = self._known[1], self.clock.monotonic_ns()
                 if self._sequence() == sequence == self._known[0]:
                     return sequence, Reading(train, 0 if train is None else train.issued(now_ns))
-        raise DeviceError("the simulated trigger died while it was writing to the wire")
+        raise DeviceError(
+            "the simulated trigger died while it was writing to the wire",
+            hint="arm again, which starts another",
+        )
 
     def _sequence(self) -> int:
         number: int = _SEQUENCE.unpack_from(self._page, 0)[0]

@@ -191,7 +191,10 @@ class SimulatedCamera:
         """Return CLOCK_MONOTONIC of the triggers of lines, which are counted since arming: (count,)."""
         train = self._wire.read().train
         if train is None or train.run != self._train:
-            raise CameraError("line times were requested from a camera that has seen no pulses of its train")
+            raise CameraError(
+                "line times were requested from a camera that has seen no pulses of its train",
+                hint="read its lines first",
+            )
         spacing = train.line_period_ns / train.speed
         pulses = self._first_pulse + first_line + np.arange(count, dtype=np.int64)
         # Whole nanoseconds and the rest separately: pulses · numerator would overflow 64 bits.

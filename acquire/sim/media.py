@@ -249,7 +249,10 @@ class _ArrayFile:
             found = np.fromfile(self._path, self._dtype, (stop - first) * values, offset=begin)
             changed = _version(self._path) != self._version
         except OSError as error:
-            raise DataError(f"{self._path}: frame {first} cannot be read: {error}") from error
+            raise DataError(
+                f"{self._path}: frame {first} cannot be read: {error}",
+                hint="a copy of the file, or its disk, if that was removed; then arm again",
+            ) from error
         if changed or len(found) < (stop - first) * values:
             raise DataError(f"{self._path} has changed while it was shown", hint="arm again")
         frames: NDArray[Any] = found.reshape(stop - first, *self._shape[1:])
@@ -301,7 +304,9 @@ class _PictureFile:
                     return checked_light(light, light.shape, str(self._path))
                 return _grey(image.convert("L"))
         except (OSError, SyntaxError, ValueError, EOFError) as error:
-            raise DataError(f"{self._path}: frame {index} cannot be read: {error}") from error
+            raise DataError(
+                f"{self._path}: frame {index} cannot be read: {error}", hint="a complete copy of the file"
+            ) from error
 
 
 def _grey(levels: Any) -> Light:
@@ -366,7 +371,10 @@ class _Container:
             try:
                 latest = next(self._decoded, None)
             except av.FFmpegError as error:
-                raise DataError(f"{self._path}: frame {self._next} cannot be decoded: {error}") from error
+                raise DataError(
+                    f"{self._path}: frame {self._next} cannot be decoded: {error}",
+                    hint="a complete copy of the file, or the video in another format",
+                ) from error
             if latest is None and self._latest is None:
                 raise UsageError(f"{self._path}: no frame can be decoded")
             # A packet need not yield a frame: the last one is then held for the missing frames at the end.

@@ -114,7 +114,10 @@ class PinPage:
             fields = self._header.copy()
             if not before & 1 and before == int(self._header[_SEQUENCE]):
                 return fields
-        raise DeviceError("the gateware's process died while it was publishing its pins")
+        raise DeviceError(
+            "the gateware's process died while it was publishing its pins",
+            hint="arm again, which starts another; python -m firmware.twin shows why it ended",
+        )
 
     @property
     def latest_run(self) -> int:
@@ -134,7 +137,10 @@ class PinPage:
         if now[_RUN] != run:
             raise _over(run)
         if int(now[_SUBSTEPS]) - max(start, 0) > ROOM:
-            raise DeviceError(f"a camera asked too late for the light of sub-step {start}")
+            raise DeviceError(
+                f"a camera asked too late for the light of sub-step {start}",
+                hint="a host that is less busy, or trigger.driver = 'simulated', which needs less of it",
+            )
         return lit.astype(np.uint8)
 
     def _await_light(self, run: int, end: int) -> NDArray[np.uint64]:
@@ -147,7 +153,10 @@ class PinPage:
             if fields[_SUBSTEPS] >= end or not fields[_RUNNING]:
                 return fields
             time.sleep(_POLL_S)
-        raise DeviceError(f"sub-step {end} of the trigger did not end within {_LIGHT_S:g} s")
+        raise DeviceError(
+            f"sub-step {end} of the trigger did not end within {_LIGHT_S:g} s",
+            hint="a host that is less busy, or trigger.driver = 'simulated', which needs less of it",
+        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -212,7 +221,10 @@ class PinCode:
 
 
 def _over(run: int) -> DeviceError:
-    return DeviceError(f"run {run} of the trigger is over, and its light is no longer kept")
+    return DeviceError(
+        f"run {run} of the trigger is over, and its light is no longer kept",
+        hint="arm the cameras again, for the present run",
+    )
 
 
 def _receive(duplicate: Any) -> PinPage:

@@ -7,7 +7,8 @@
         │ holds its standard input open          │ publishes its pins
         └─ closed, or its owner killed: it ends  └──▶ PinPage ──▶ simulated cameras
 
-The gateware is only in a checkout, next to the package, and needs a C++ compiler: its first start builds it.
+The gateware is only in a checkout or source archive, next to the package, and needs a C++ compiler: its
+first start builds it.
 """
 
 from __future__ import annotations
@@ -23,6 +24,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from acquire import __version__
 from acquire.errors import TriggerError, UsageError
 from acquire.trigger.transports.serial import SerialTransport
 
@@ -32,6 +34,12 @@ if TYPE_CHECKING:
 ROOT = Path(__file__).parents[2]
 """The root of the checkout, if the package runs from one."""
 COMPILER = "g++"
+# The extra [firmware] installs the tools; a module of such a name does not belong among installed packages.
+_WHERE = "which are in a checkout and in the source archive, but not in an installed package"
+_HOW = (
+    f"pip download --no-deps --no-binary=:all: tdi-acquire=={__version__}; unpack that, and "
+    "pip install -e '.[firmware]' in it"
+)
 CLOCKS_PER_BIT = 8
 """Clock cycles per bit of the link: fewer cycles make the simulated link faster."""
 _START_S = 1800.0
@@ -47,9 +55,12 @@ def baud(clock_hz: int) -> int:
 
 def missing() -> str | None:
     """Name the first requirement for running the gateware that is not met; None if all are."""
-    if not (ROOT / "firmware" / "twin.py").is_file():
-        return "the gateware's sources, which are in a checkout (git clone, then pip install -e .)"
-    return missing_tools()
+    return missing_tools() if has_sources() else f"the gateware's sources, {_WHERE}"
+
+
+def has_sources() -> bool:
+    """Return whether the gateware lies beside the package."""
+    return (ROOT / "firmware" / "twin.py").is_file()
 
 
 def missing_tools() -> str | None:
@@ -64,7 +75,11 @@ def missing_tools() -> str | None:
 def demand() -> None:
     """Raise UsageError, which states what to install, unless the gateware can be run here."""
     if reason := missing():
-        raise UsageError(f"trigger 'rtl' runs the gateware itself, which needs {reason}")
+        raise UsageError(
+            f"trigger 'rtl' runs the gateware itself, which needs {reason}",
+            possible="trigger.driver = 'simulated', a model of the same trigger",
+            hint="" if has_sources() else _HOW,
+        )
 
 
 def build(clock_hz: int) -> None:
@@ -133,10 +148,16 @@ def _first_report(process: subprocess.Popen[bytes]) -> dict[str, Any]:
                 )
             line += piece
     if not line.endswith(b"\n"):
-        raise TriggerError(f"the gateware's process did not start within {_START_S:g} s")
+        raise TriggerError(
+            f"the gateware's process did not start within {_START_S:g} s",
+            hint="a host that is less busy; python -m firmware.twin shows what it does",
+        )
     report: dict[str, Any] = json.loads(line)
     if "error" in report:
-        raise TriggerError(f"the gateware's process ended: {report['error']}")
+        raise TriggerError(
+            f"the gateware's process ended: {report['error']}",
+            hint="python -m firmware.twin, which shows why",
+        )
     return report
 
 

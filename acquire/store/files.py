@@ -334,7 +334,7 @@ def lock(path: Path, doing: str, *, surely: bool = False) -> int:
     except BlockingIOError as error:
         os.close(fd)
         raise StateError(
-            f"{doing} {path}: another process is writing it", hint="try again when its recording has ended"
+            f"{doing} {path}: another process is writing it", hint="again, when its recording has ended"
         ) from error
     except OSError as error:
         if error.errno not in NO_LOCKS:
@@ -343,7 +343,8 @@ def lock(path: Path, doing: str, *, surely: bool = False) -> int:
         if surely:
             os.close(fd)
             raise StateError(
-                f"{doing} {path}: its file system has no locks, which would show whether it is being written"
+                f"{doing} {path}: its file system has no locks, which would show whether it is being written",
+                hint="a copy of it on a disk of this host, or a mount with locks",
             ) from error
     return fd
 

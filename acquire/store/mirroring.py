@@ -214,7 +214,10 @@ class Mirror:
         """
         recording = open_recording(self.path)
         if _identity(recording.attrs) != self._identity:
-            raise DataError(f"{self.path} is no longer the same recording: run {recording.attrs['run_id']}")
+            raise DataError(
+                f"{self.path} is no longer the same recording: run {recording.attrs['run_id']}",
+                hint="acquire upload again, to another place",
+            )
         sealed = recording.state == "sealed"
         if sealed and not self._sealed:  # a recovery may have mended files that are copied already
             refuse_links(self.path)

@@ -116,7 +116,9 @@ class Outline:
         try:
             return Fibre.of(self.attrs["geometry"])
         except UsageError as error:
-            raise DataError(f"{self}: {error}") from error
+            raise DataError(
+                f"{self}: {error}", hint="a copy of the recording, or of its zarr.json"
+            ) from error
 
     @property
     def dropped(self) -> tuple[tuple[int, int], ...]:

@@ -86,7 +86,10 @@ def rebuild_root(path: Path, disk: Disk) -> None:
         publisher = Publisher(path / ARMS[0] / "lines" / SCRATCH, disk)
         publisher.replace(path / ROOT, layout.to_json(layout.group_document(attributes, nodes)), durable=True)
     except OSError as error:
-        raise DataError(f"{path}: its root cannot be rebuilt: {error.strerror or error}") from error
+        raise DataError(
+            f"{path}: its root cannot be rebuilt: {error.strerror or error}",
+            hint="free space on its disk, and the permissions of its directory; then acquire recover again",
+        ) from error
 
 
 def _arms(path: Path, attributes: dict[str, Any]) -> dict[str, layout.Document]:
@@ -119,7 +122,8 @@ def _arms(path: Path, attributes: dict[str, Any]) -> dict[str, layout.Document]:
         group = {"first_line": int(attributes["first_line"])}
     except layout.PARSE_ERRORS as error:
         raise DataError(
-            f"{path}: its root zarr.json is lost, and its arrays are damaged: {cause_in_words(error)}"
+            f"{path}: its root zarr.json is lost, and its arrays are damaged: {cause_in_words(error)}",
+            hint="a copy of the recording, or of its zarr.json",
         ) from error
     ordered: dict[str, layout.Document] = {}  # zarr relies on a group being followed by its members
     for arm in ARMS:

@@ -51,13 +51,19 @@ def remove(disk: Disk, path: Path, proof: Unborn | Dropped) -> None:
     match proof:
         case Unborn(committed_lines):
             if committed_lines:
-                raise DataError(f"{path} is not removed: {committed_lines} lines of it were committed")
+                raise DataError(
+                    f"{path} is not removed: {committed_lines} lines of it were committed",
+                    hint="acquire recover, which seals it with these lines",
+                )
             refuse_links(path)
             _refuse_lines(path)
             disk.remove_tree(path)
         case Dropped(shard, listed):
             if not any(shard in shards for shards in listed):
-                raise DataError(f"{path}: shard {shard} is not deleted: it is not listed as dropped")
+                raise DataError(
+                    f"{path}: shard {shard} is not deleted: it is not listed as dropped",
+                    hint="acquire verify, which lists the lines that are there",
+                )
             files = shard_files(path, shard)
             for file in files:
                 refuse_link(path, file)
@@ -72,13 +78,19 @@ def _refuse_lines(path: Path) -> None:
     """Raise DataError if a directory holds, or may hold, what came after a recording's preparation."""
 
     def unknown(error: OSError) -> None:
-        raise DataError(f"{path} is not removed: what it holds cannot be listed: {error.strerror}")
+        raise DataError(
+            f"{path} is not removed: what it holds cannot be listed: {error.strerror}",
+            hint="the permissions of its directories, or the disk",
+        )
 
     # Without `unknown`, a directory that cannot be listed now would count as an empty one.
     for directory, _, names in os.walk(path, onerror=unknown):
         if odd := sorted(set(names) - _MADE_FIRST):
             held = f"{os.path.relpath(directory, path)}/{odd[0]}"
-            raise DataError(f"{path} is not removed: it holds {held}")
+            raise DataError(
+                f"{path} is not removed: it holds {held}",
+                hint="look at what it holds, and delete it yourself if it is not needed",
+            )
 
 
 def shard_files(path: Path, shard: int) -> list[Path]:
@@ -107,7 +119,10 @@ def shard_numbers(array: Path) -> list[int]:
     except (FileNotFoundError, NotADirectoryError):
         return []
     except OSError as error:
-        raise DataError(f"{array} cannot be listed: {error.strerror}") from error
+        raise DataError(
+            f"{array} cannot be listed: {error.strerror}",
+            hint="the permissions of its directories, or the disk",
+        ) from error
     # Zarr writes plain decimal numbers: `007`, `²` and numbers beyond 64 bits are names of somebody else's.
     short = (name for name in names if name.isascii() and name.isdecimal() and len(name) < 19)
     return sorted(int(name) for name in short if str(int(name)) == name)

@@ -102,7 +102,10 @@ def _name(first: Path, segments: list[str], disk: Disk) -> None:
     document = read_root(LocalSource(first))
     listed = document["attributes"].get("segments", [])
     if not isinstance(listed, list):
-        raise DataError(f"{first}: segments is {listed!r:.50}, not a list of names")
+        raise DataError(
+            f"{first}: segments is {listed!r:.50}, not a list of names",
+            hint="a copy of its zarr.json; the lines in a/ and b/ do not depend on it",
+        )
     if new := [name for name in segments if name not in listed]:
         # A recovered segment may be listed after its successors. By length first: NAME-2 before NAME-10.
         document["attributes"]["segments"] = sorted([*listed, *new], key=lambda name: (len(name), name))

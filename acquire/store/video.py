@@ -153,14 +153,17 @@ def write_video(
     provenance: Mapping[str, Any],
     pixel_unit: str | None = "micrometer",
     origin: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    quality: NDArray[np.float32] | None = None,
+    error: NDArray[np.float32] | None = None,
 ) -> None:
     """Write ``video`` (t, y, x) float32, uint16 or uint8 as a new OME-Zarr 0.5 image.
 
     ``pixel_size`` is the side of a pixel in ``pixel_unit``, a UDUNITS-2 name of a length, or None if only
     ratios are known. ``origin`` is the start of the first frame in seconds, and the centre of the first pixel
-    (y, x). ``provenance["trusted"]``, first frame and the one after the last, marks the trusted frames. The
-    image appears whole or not at all. Raises UsageError for an impossible video, before anything is changed,
-    and StoreError if the disk refuses.
+    (y, x). ``provenance["trusted"]``, first frame and the one after the last, marks the trusted frames.
+    ``quality`` (t,) is the residual of each frame's lines, ``error`` (t, region_y, region_x) the estimated
+    error of its regions, NaN where it is unknown. The image appears whole or not at all. Raises
+    UsageError for an impossible video, before anything is changed, and StoreError if the disk refuses.
     """
     if video.ndim != 3 or video.size == 0 or video.dtype.name not in DTYPES:
         raise UsageError(
@@ -170,14 +173,25 @@ def write_video(
         raise UsageError(
             f"time stamps cannot be {time_ns.dtype} {time_ns.shape}", possible=f"int64 ({len(video)},)"
         )
+    if quality is not None and quality.shape != time_ns.shape:
+        raise UsageError(f"the quality of frames cannot be {quality.shape}", possible=f"({len(video)},)")
+    if error is not None and (quality is None or error.ndim != 3 or len(error) != len(video)):
+        raise UsageError(
+            f"the errors of frames cannot be {error.shape}{' without a quality' if quality is None else ''}",
+            possible=f"({len(video)}, region_y, region_x), with a quality",
+        )
     for name, value in (("pixel size", pixel_size), ("frame interval", frame_interval_ns)):
         if not (math.isfinite(value) and value > 0):
             raise UsageError(f"a video cannot have a {name} of {value}", possible="a finite number above 0")
     check_provenance(provenance)  # `finish` checks it as well, but only once the frames are written
     rows, columns = video.shape[1:]
     grid = VideoGrid((frame_interval_ns * 1e-9, pixel_size, pixel_size), origin, pixel_unit)
-    with VideoWriter(place, (rows, columns), video.dtype, grid) as writer:
-        writer.append(video, time_ns)
+    regions = None if error is None else (error.shape[1], error.shape[2])
+    has_quality = quality is not None
+    with VideoWriter(
+        place, (rows, columns), video.dtype, grid, quality=has_quality, regions=regions
+    ) as writer:
+        writer.append(video, time_ns, quality, error)
         writer.finish(provenance)
 
 
@@ -216,7 +230,10 @@ def open_video(place: Path | str) -> VideoFile:
     except (GroupNotFoundError, NotADirectoryError) as error:
         raise PlaceError(f"{source} is not a video: it is not a Zarr group", hint=_VIDEO) from error
     except DAMAGE as error:
-        raise DataError(f"{source} is not a video, or is damaged: {cause_in_words(error)}") from error
+        raise DataError(
+            f"{source} is not a video, or is damaged: {cause_in_words(error)}",
+            hint="a copy of the video, or acquire reconstruct once more",
+        ) from error
     return found
 
 

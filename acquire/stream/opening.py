@@ -6,6 +6,7 @@ from collections import deque
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
+from acquire.errors import StoreError
 from acquire.store.suspect import CODE_EVENTS, DOUBTFUL
 from acquire.stream.messages import Note
 
@@ -62,3 +63,9 @@ class Notes:
 def is_verdict(note: Note, *, before: int) -> bool:
     """Return whether the note is a verdict on the code that began before the line ``before``."""
     return note.kind in CODE_EVENTS and note.line < before
+
+
+def not_created(error: Exception) -> StoreError:
+    """Return the error of a recording whose files could not be created."""
+    what = f"the recording cannot be created: {error!r}"
+    return StoreError(what, hint="free space and memory on this host, or another directory")

@@ -39,7 +39,10 @@ class ForeignBytes(SharedBytes):
         # The path names a number of the owner's, which may stand for another file by now.
         if os.fstat(self._fd).st_size != size:
             os.close(self._fd)
-            raise DeviceError(f"the lines cannot be read: {path} is not the memory of this ring")
+            raise DeviceError(
+                f"the lines cannot be read: {path} is not the memory of this ring",
+                hint="again in a moment: the instrument was disarmed or armed again",
+            )
         try:
             self.map = mmap.mmap(self._fd, size, flags=mmap.MAP_SHARED, prot=mmap.PROT_READ)
         except BaseException:

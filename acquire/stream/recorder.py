@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from acquire.errors import AcquireError, StateError, StoreError, UsageError
+from acquire.errors import AcquireError, StateError, UsageError
 from acquire.lines import ARMS
 from acquire.processes.messages import Ready
 from acquire.processes.rank import become_important
@@ -32,7 +32,7 @@ from acquire.stream.external_counts import RECORDER, ExternalCounts
 from acquire.stream.kept import Kept
 from acquire.stream.losses import Cause
 from acquire.stream.messages import Began, Begin, Cancel, End, Extend, Interrupt, Note, Refused, RunStarted
-from acquire.stream.opening import Notes, Opening, is_verdict
+from acquire.stream.opening import Notes, Opening, is_verdict, not_created
 from acquire.stream.recorder_states import BUSY, STATES, TABLE, RecorderEvent, RecorderState, after
 from acquire.stream.session import OPEN_END, Session
 from acquire.stream.stalls import HELD_UP_S, Arm, Backlog, DiskWaits, HoldUps, find_stall
@@ -313,7 +313,7 @@ class Recorder:
             self._refuse(error)
             return
         except (OSError, ValueError, MemoryError) as error:
-            self._refuse(StoreError(f"the recording cannot be created: {error!r}"))
+            self._refuse(not_created(error))
             return
         self._cut_short = False
         self._go(RecorderEvent.CREATED)

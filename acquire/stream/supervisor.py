@@ -137,7 +137,8 @@ class Supervisor:
             self._thread.join(_JOIN_S)
         if self._thread.is_alive():
             raise TriggerError(
-                f"the trigger has not returned from a wait of {_TAG_WAIT_S} s for {_JOIN_S:g} s"
+                f"the trigger has not returned from a wait of {_TAG_WAIT_S} s for {_JOIN_S:g} s",
+                hint="check its cable and power, then restart the daemon",
             )
 
     def mark_unsealed(self) -> None:
@@ -158,7 +159,7 @@ class Supervisor:
                 self.life.on_overdue()
                 self._workers[RECORDER].post(Cancel())
             if self.fault is not None:
-                raise DeviceError(f"start: {self.fault}")
+                raise DeviceError(f"start: {self.fault}", hint="acquire disarm, then check the device")
         waits = self._counters[RECORDER]["disk_since_ns"] or self._counters[RECORDER]["store_since_ns"]
         state = "it waits for the disk" if waits else f"no sign of life for {self.silent_s:.1f} s"
         raise DeviceError(

@@ -25,6 +25,7 @@ if TYPE_CHECKING:
 
 ANSWER_S = 3.0
 """Time within which the device has done anything that it does at once."""
+UNANSWERED = "acquire trigger info shows its state; if that does not change, power it off and on"
 # The quickest comparison is used: a slower one was delayed somewhere, before or after the device's reading.
 _COMPARISONS = 8
 _LOOK_AGAIN_S = 0.001
@@ -113,7 +114,12 @@ class Device:
         )
 
     def await_status(
-        self, done: Callable[[DeviceStatus], bool], limit_s: float, what: str, ticks: int = 0
+        self,
+        done: Callable[[DeviceStatus], bool],
+        limit_s: float,
+        what: str,
+        ticks: int = 0,
+        hint: str = UNANSWERED,
     ) -> DeviceStatus:
         """Poll until ``done``. Raises TriggerError if the device did not do ``what`` in time.
 
@@ -129,7 +135,10 @@ class Device:
                 # A stopped clock measures nothing: without this, a device without a clock is awaited forever.
                 if now == seen or signed_ticks(seen - begun) > ticks:
                     given_s = deadline_s - begun_s
-                    raise TriggerError(f"the trigger did not {what} within {given_s:.3g} s: {status}")
+                    raise TriggerError(
+                        f"the trigger did not {what} within {given_s:.3g} s: {status}",
+                        hint=hint,
+                    )
                 seen, deadline_s = now, time.monotonic() + limit_s
             time.sleep(_LOOK_AGAIN_S)
         return status
@@ -153,7 +162,11 @@ class Device:
         self.link.write(first.address, words)
         for register, have in self.configuration().items():
             if have != values[register]:
-                raise TriggerError(f"{register.name} reads {have:#x} where {values[register]:#x} was written")
+                raise TriggerError(
+                    f"{register.name} reads {have:#x} where {values[register]:#x} was written",
+                    hint="acquire trigger info shows whether its firmware is the one for this program; "
+                    "check cable and power",
+                )
 
     def configuration(self) -> dict[Register, int]:
         """Return the values of the config registers."""
@@ -182,7 +195,10 @@ class Device:
         self.await_status(lambda status: not status.busy, ANSWER_S, "check its code")
         crc = self.read(r.CODE_CRC)
         if crc != zlib.crc32(packed):
-            raise TriggerError(f"the code memory has CRC {crc:#010x}, not {zlib.crc32(packed):#010x}")
+            raise TriggerError(
+                f"the code memory has CRC {crc:#010x}, not {zlib.crc32(packed):#010x}",
+                hint="load it once more; if it fails again, acquire trigger selftest checks the memory",
+            )
         return crc
 
     def read_code(self, length: int) -> NDArray[np.uint8]:

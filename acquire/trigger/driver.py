@@ -29,7 +29,7 @@ from acquire.clock import NS_PER_S, ClockFit
 from acquire.errors import TriggerError
 from acquire.trigger import registers as r
 from acquire.trigger.base import LineTag, TagEvent, TriggerIdentity
-from acquire.trigger.device import ANSWER_S, Device, DeviceStatus
+from acquire.trigger.device import ANSWER_S, UNANSWERED, Device, DeviceStatus
 from acquire.trigger.link import Link
 from acquire.trigger.registers import Command, State
 from acquire.trigger.settings import register_values
@@ -142,12 +142,18 @@ class TriggerDriver:
             if not external:
                 device.command(Command.START, run_number(run.run_id))
         # Without the lock from here on: `stop` must be able to end the wait for an edge that never comes.
-        limit_s = self._config.external_timeout_s if external else ANSWER_S
+        limit_s, hint = ANSWER_S, UNANSWERED
+        if external:
+            limit_s = self._config.external_timeout_s
+            hint = "check what gives the external start, or give it longer: trigger.external_timeout_s"
         status = device.await_status(
-            lambda status: status.lines > 0 or status.state == State.ENDED, limit_s, "start"
+            lambda status: status.lines > 0 or status.state == State.ENDED, limit_s, "start", hint=hint
         )
         if not status.lines:
-            raise TriggerError(f"run {run.run_id!r} was stopped before its first line")
+            raise TriggerError(
+                f"run {run.run_id!r} was stopped before its first line",
+                hint="arm again; acquire trigger info shows its state and why it stopped",
+            )
         start_tick = device.read(r.START_TIME)
         if external:  # the edge may have come long after the first comparison, and clocks drift
             compared = device.compare_clocks()

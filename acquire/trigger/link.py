@@ -149,7 +149,7 @@ class Link:
         # The reader ends before its transport: the number of a closed descriptor may be reused for another
         # file.
         self._ending.set()
-        self._die(TriggerError(f"{self.transport.name} was closed"))
+        self._die(TriggerError(f"{self.transport.name} was closed", hint="open it again"))
         # A read returns after `READ_WAIT_S`: this takes longer only if the port's driver hangs.
         self._reader.join(_END_S)
         self.transport.close()
@@ -184,7 +184,12 @@ class Link:
         except TriggerError as error:
             self._die(error)
         except Exception as error:  # noqa: BLE001 - the outermost boundary of the thread: raised in callers
-            self._die(TriggerError(f"{self.transport.name}: {type(error).__name__}: {error}"))
+            self._die(
+                TriggerError(
+                    f"{self.transport.name}: {type(error).__name__}: {error}",
+                    hint="check cable and power, then arm again",
+                )
+            )
 
     def _die(self, error: TriggerError) -> None:
         with self._news:

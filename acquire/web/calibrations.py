@@ -98,5 +98,6 @@ def _finding(known: Calibration, name: str) -> FindingFacts:
         )
     except (LookupError, TypeError, ValueError) as error:
         raise DataError(
-            f"the step {name!r} of the calibration cannot be read: {cause_in_words(error)}"
+            f"the step {name!r} of the calibration cannot be read: {cause_in_words(error)}",
+            hint="measure it again",
         ) from error

@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
+import zarr
 from two_squares import record_two_squares
 
 from acquire.config.scene import ArmOptics
+from acquire.lines import ARMS
 from acquire.sim.effects.light import CodeErrors
 from acquire.store import open_video
 
@@ -44,6 +48,27 @@ def test_missing_lines(cli: Cli, late: Path) -> None:
     answer = cli("diagnose", late, "--first-line", 100_000_000)
     assert answer.code == 2
     assert "has no line 100000000" in answer.err
+
+
+@pytest.mark.parametrize(
+    ("level", "kind"), [(0, "dark"), (20, "stuck"), (2**16 - 1, "no_samples")], ids=["dark", "stuck", "white"]
+)
+def test_lines_that_say_nothing_are_named_as_such_in_both_arms(
+    cli: Cli, late: Path, tmp_path: Path, level: int, kind: str
+) -> None:
+    """Dark lines were another run's code, and of two arms with the same defect one was named."""
+    path = tmp_path / "run.zarr"
+    shutil.copytree(late, path)
+    with zarr.config.set({"array.write_empty_chunks": True}):
+        for arm in ARMS:
+            lines = zarr.open_array(path / arm / "lines", mode="r+")
+            lines[:] = np.full(lines.shape, min(level, np.iinfo(lines.dtype).max), lines.dtype)
+    answer = cli("diagnose", path)
+    assert answer.code == 1, answer.err
+    assert "cannot tell: the lines cannot be compared with their code" in answer.out
+    also = next(line for line in answer.out.splitlines() if line.startswith(f"also ({kind})"))
+    assert "arm a " in also
+    assert "arm b " in also
 
 
 @pytest.fixture(scope="module")

@@ -187,6 +187,23 @@ def test_nothing_slow_is_done_for_a_file_that_exists(cli: Cli, recording: Path, 
     assert "looking for changes" not in answer.err
 
 
+@pytest.mark.parametrize("name", ["v.mp4", "v.ome.tif", "v.NPZ"])
+def test_the_name_of_a_file_is_refused(cli: Cli, recording: Path, tmp_path: Path, name: str) -> None:
+    """It became a directory of this name, which no program would open."""
+    answer = cli("reconstruct", recording, "--out", tmp_path / name)
+    assert answer.code == 2
+    assert "acquire export or acquire render" in answer.err
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_range_that_ends_before_it_begins_is_named_as_such(
+    cli: Cli, recording: Path, tmp_path: Path
+) -> None:
+    answer = cli("reconstruct", recording, "--out", tmp_path / "v.zarr", "--from", "500us", "--to", "200us")
+    assert answer.code == 2
+    assert "a range from 500us to 200us is empty" in answer.err
+
+
 def test_the_same_voxels_twice_are_one_video(cli: Cli, recording: Path, tmp_path: Path) -> None:
     words = ("--lines", 60, "--voxels", "2x3", "--voxels", "2x3", "--iterations", 2)
     assert cli("reconstruct", recording, "--out", tmp_path / "v.zarr", *words).code == 0

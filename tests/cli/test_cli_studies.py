@@ -17,6 +17,15 @@ from acquire.simulate import simulate
 Cli = Callable[..., Any]
 
 
+@pytest.mark.parametrize("words", [("paper", "fig9"), ("tradeoff", "scene-leds"), ("demo",)])
+def test_a_directory_that_cannot_be_created_says_so(cli: Cli, words: tuple[str, ...]) -> None:
+    """Only the system's words were passed on: what cannot be done was not said, nor what to try."""
+    answer = cli(*words, "--out", "/proc/acquire-page")
+    assert answer.code == 2
+    assert "/proc/acquire-page cannot be created: " in answer.err
+    assert "another path" in answer.err
+
+
 @pytest.mark.parametrize(
     ("words", "said"),
     [

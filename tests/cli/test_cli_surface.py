@@ -160,6 +160,16 @@ def test_interrupted(cli: Cli, monkeypatch: pytest.MonkeyPatch) -> None:
     assert cli("status").code == EXIT_INTERRUPTED
 
 
+def test_interrupted_in_the_body_of_a_class(cli: Cli, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Python before 3.12 makes a RuntimeError of it: Ctrl-C during imports gave a traceback and code 1."""
+
+    def interrupted(_: object) -> None:
+        raise RuntimeError("Error calling __set_name__") from KeyboardInterrupt()
+
+    monkeypatch.setattr(control, "status_document", interrupted)
+    assert cli("status").code == EXIT_INTERRUPTED
+
+
 @pytest.mark.parametrize("words", [["--help"], ["status", "--help"], ["serve", "--help"]])
 def test_help_loads_nothing_heavy(words: list[str]) -> None:
     code = (

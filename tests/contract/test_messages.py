@@ -61,6 +61,41 @@ def made(tree: ast.AST) -> list[tuple[int, str]]:
     return found
 
 
+ADVISED = frozenset(
+    "DeviceError TriggerError CameraError CameraLostError StoreError DataError".split()  # noqa: SIM905
+)
+"""Errors of devices, disks and data: not the request is wrong, and what to do about it is not evident."""
+
+
+def unadvised(tree: ast.AST) -> list[int]:
+    """Line of every such error that is made without a word on what is possible or what to try."""
+    return [
+        call.lineno
+        for call in ast.walk(tree)
+        if isinstance(call, ast.Call)
+        and getattr(call.func, "attr", getattr(call.func, "id", "")) in ADVISED
+        and call.args
+        and not {keyword.arg for keyword in call.keywords} & {"hint", "possible", None}
+    ]
+
+
+def test_errors_of_devices_and_data_say_what_to_try() -> None:
+    """About 60 stated what had failed, and left the operator alone with it."""
+    without = [
+        f"{path.relative_to(PACKAGE)}:{line}"
+        for path in sorted(PACKAGE.rglob("*.py"))
+        for line in unadvised(ast.parse(path.read_text(encoding="utf-8")))
+    ]
+    assert not without, "add a hint, or what is possible:\n" + "\n".join(without)
+
+
+def test_an_error_without_advice_is_found() -> None:
+    text = (
+        "raise CameraError('it is gone')\nraise CameraError('it is gone', hint='x')\nraise UsageError('no')"
+    )
+    assert unadvised(ast.parse(text)) == [1]
+
+
 def test_every_error_has_a_verb() -> None:
     checked, without = 0, []
     for path in sorted(PACKAGE.rglob("*.py")):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import multiprocessing
 import os
 import signal
 import subprocess
@@ -31,7 +32,7 @@ from acquire.reconstruct.budget import Budget
 from acquire.sim.leds import LedSceneConfig
 from acquire.sim.scenes import build_scene
 from acquire.sim.voxels import truth
-from acquire.store import open_recording, open_video
+from acquire.store import Recording, open_recording, open_video
 
 QUICK = Options(iterations=16)
 
@@ -254,10 +255,52 @@ def test_progress_never_exceeds_the_whole_despite_trials(recording_path, tmp_pat
     assert seen[-1] == pytest.approx(1.0)
 
 
+@pytest.mark.parametrize("refused", [True, False], ids=["all lines", "all but one"])
+def test_a_sub_segment_without_any_line_is_refused_before_the_others_are_solved(
+    recording_path, request_of_three, tmp_path, monkeypatch, refused
+):
+    """It was found out when its turn came, and the minutes before were lost; nothing said which lines."""
+    middle = request_of_three.sub_segments()[1]
+    first, end = middle.first_line, middle.first_line + middle.lines
+    lost = {
+        "a": [range(end - 10, end + 5), range(first - 5, end - 10)],
+        "b": [range(3), range(first, end)],
+    }
+    if not refused:
+        lost["b"][1] = range(first, end - 1)
+    monkeypatch.setattr(Recording, "lost_rows", lambda self, arm: lost[arm])
+    if refused:
+        with pytest.raises(UsageError, match=rf"lines {first} to {end - 1}: both arms have lost all"):
+            run(recording_path, request_of_three, tmp_path / "v.zarr")
+        assert not (tmp_path / "v.zarr").exists()
+    else:
+        assert run(recording_path, request_of_three, tmp_path / "v.zarr").shape[0] > 0
+
+
 def test_a_failing_sub_segment_leaves_nothing(recording_path, request_of_three, tmp_path):
     with pytest.raises(UsageError, match="solver"):
         run(recording_path, request_of_three, tmp_path / "v.zarr", Options(solver="magic"), workers=2)
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_to_all_processes_ends_none_of_those_that_are_still_starting(
+    recording_path, request_of_three, tmp_path, number
+):
+    """Ctrl-C, and the SIGTERM of `timeout`, reach them too: the command failed for lack of memory."""
+    told = set()
+
+    def stop():
+        for child in multiprocessing.active_children():
+            if child.pid not in told:  # a tenth of a second old
+                told.add(child.pid)
+                os.kill(child.pid, number)
+        return True
+
+    outcome = run(recording_path, request_of_three, tmp_path / "v.zarr", workers=2, stop=stop)
+    assert told
+    assert outcome.interrupted
+    assert open_video(tmp_path / "v.zarr").attrs["provenance"]["state"] == "interrupted"
 
 
 def test_ctrl_c_keeps_the_best_so_far(recording_path, tmp_path):

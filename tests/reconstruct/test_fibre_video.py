@@ -12,6 +12,7 @@ from acquire.config import RigConfig, load_rig
 from acquire.config.scene import ConstantDrive, SineDrive
 from acquire.errors import UsageError
 from acquire.fibre import Tile
+from acquire.noise import Noise
 from acquire.recon import reconstruct
 from acquire.recon.reuse import Choice
 from acquire.recon.segments import Voxels
@@ -111,6 +112,24 @@ def test_lines_distinguish_changing_tiles_from_tiles_at_rest(recording: Recordin
     change = {str(tile): energies(recording.cut(0, LINES, tile))[1] for tile in recording.fibre.tiles}
     assert max(change, key=lambda tile: change[tile]) == "0,2"
     assert max(change["0,0"], change["1,0"]) < 0.1 * change["0,2"]
+
+
+@pytest.mark.parametrize("arm", [0, 1])
+def test_an_arm_with_too_few_complete_lines_does_not_hide_the_change_that_the_other_shows(
+    recording: Recording, arm: int
+) -> None:
+    """Both arms' noise was subtracted from the residual of one: a tile with a gap seemed to be at rest."""
+    segment = recording.cut(0, LINES, Tile(0, 2))
+    alone, few = segment.mask.copy(), segment.mask.copy()
+    alone[arm] = False
+    line, pixel = np.ogrid[20:LINES, : segment.geometry.stages]
+    few[arm, 20:] &= (line + pixel) % 3 > 0  # 20 lines are complete: too few for a fit
+    without_noise = energies(replace(segment, mask=alone, noise=None))[1]
+    dark_dn = float(np.sqrt(0.6 * without_noise) * np.mean(segment.responsivity_dn))
+    noisy = replace(segment, noise=Noise((0.0, 0.0), (dark_dn, dark_dn)))
+    change = energies(replace(noisy, mask=alone))[1]
+    assert change == pytest.approx(0.4 * without_noise, rel=0.05)
+    assert energies(replace(noisy, mask=few))[1] == pytest.approx(change)
 
 
 def test_a_choice_that_does_not_fit_is_searched_again(recording: Recording) -> None:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import errno
 import json
+from dataclasses import replace
 
 import pytest
 
@@ -47,6 +49,41 @@ def test_presets_are_compared_on_the_same_scenes():
 def test_the_slowest_scene_decides_what_fits():
     slow = [*GOOD[:2], Learned("admm", "balanced", 3, 1, 1000, "bullet", 12.0, 23.5)]
     assert choose([*FAST, *slow], 10.0, 1000).preset == "fast"
+
+
+def test_voxels_of_another_size_are_never_mixed_in():
+    """They are as many by chance; of each scene, the last result in the file counted, whatever its voxels."""
+    coarse = [replace(each, spatial_merge=6, temporal_merge=4, psnr_db=90.0) for each in FAST]
+    slow = [replace(each, spatial_merge=6, temporal_merge=4, seconds=9.5) for each in GOOD]
+    for known in ([*FAST, *GOOD, *coarse, *slow], [*coarse, *slow, *FAST, *GOOD]):
+        assert choose(known, 10.0, 1000, (3, 1)).preset == "balanced"
+        assert choose(known, 9.0, 1000, (3, 1)).preset == "balanced"
+        assert choose(known, 10.0, 1000, (6, 4)).preset == "fast"
+
+
+def test_without_results_of_that_size_the_one_tried_on_most_scenes_counts():
+    few = [replace(each, spatial_merge=6, temporal_merge=4) for each in tried("fast", 0.1, 99.0)]
+    for known in ([*few, *FAST, *GOOD], [*FAST, *GOOD, *few]):
+        assert choose(known, 10.0, 1000).preset == "balanced"
+        assert choose(known, 10.0, 1000, (2, 2)).preset == "balanced"
+
+
+@pytest.mark.parametrize("step", ["write_text", "replace"])
+def test_a_disk_that_refuses_leaves_the_results_as_they_were(tmp_path, monkeypatch, step):
+    path = tmp_path / "t.json"
+    remember(FAST, path)
+
+    def refuse(part, *args, **_):
+        if step == "write_text":
+            part.write_bytes(b"{")  # as much as the disk had room for
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(type(path), step, refuse)
+    with pytest.raises(OSError, match="No space left"):
+        remember(GOOD, path)
+    monkeypatch.undo()
+    assert set(recall(path)) == set(FAST)
+    assert list(tmp_path.iterdir()) == [path]
 
 
 def test_results_are_kept_and_replaced(tmp_path):

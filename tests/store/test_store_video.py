@@ -207,6 +207,10 @@ def test_an_existing_path_is_refused(tmp_path):
         {"pixel_size": 0.0},
         {"frame_interval_ns": float("inf")},
         {"provenance": {"x": np.float32(1)}},
+        {"quality": np.zeros(4, np.float32)},
+        {"error": np.zeros((5, 8, 8), np.float32)},
+        {"quality": np.zeros(5, np.float32), "error": np.zeros((4, 8, 8), np.float32)},
+        {"quality": np.zeros(5, np.float32), "error": np.zeros((5, 8), np.float32)},
     ],
 )
 def test_what_cannot_be_written_is_refused_untouched(tmp_path, wrong):

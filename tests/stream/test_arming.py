@@ -17,8 +17,16 @@ from acquire.trigger.base import TriggerRun
     [
         ("refuse", CameraError, "camera b is in use; possible: another; try: unplug it"),
         ("bug", AcquireError, "grabber b: ZeroDivisionError: a bug"),
-        ("die", DeviceError, "grabber b: killed by SIGKILL"),
-        ("hang", DeviceError, "grabber b: it did not answer in time"),
+        (
+            "die",
+            DeviceError,
+            "grabber b: killed by SIGKILL; try: look into the log of this program, and the kernel's",
+        ),
+        (
+            "hang",
+            DeviceError,
+            "grabber b: it did not answer in time; try: again, on a host that is less busy",
+        ),
         ("trigger", TriggerError, "the run is too fast"),
     ],
 )

@@ -137,11 +137,11 @@ class _GError(ctypes.Structure):
 
 
 @contextmanager
-def errors(what: str) -> Iterator[Any]:
-    """Yield a place for a GError; raise CameraError if one was stored there."""
+def errors(what: str, hint: str = "") -> Iterator[Any]:
+    """Yield a place for a GError; raise CameraError, with the hint, if one was stored there."""
     place = POINTER(_GError)()  # NULL: GLib reports no error into a place that seems to have one
     yield byref(place)
     if ctypes.cast(place, c_void_p).value:
         message = (place.contents.message or b"").decode(errors="replace")
         load().g_error_free(place)
-        raise CameraError(f"{what}: {message}")
+        raise CameraError(f"{what}: {message}", hint=hint)

@@ -48,6 +48,7 @@ _NO_PACKET_SOCKET = 1
 interface until its filter is in place."""
 _HEADERS_BYTES = 36
 """Headers of IP, UDP and GVSP in every packet of a frame."""
+REACH = "check its cable, power and address, and that no other program controls it"
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,7 +75,7 @@ class AravisCamera:
         self._payload = 0
         self._camera: int | None = None
         device_id = spec.cti.encode() if spec.cti not in ("", FAKE) else _find(library, spec)
-        with errors(f"open camera {spec.serial}") as error:
+        with errors(f"open camera {spec.serial}", REACH) as error:
             self._camera = library.arv_camera_new(device_id, error)
         try:
             self._device = library.arv_camera_get_device(self._camera)
@@ -111,7 +112,7 @@ class AravisCamera:
         """Return the stream of the next acquisition, whose new socket gets no packet of an earlier one."""
         if self._stream is None:
             found = self._format()
-            with errors(f"stream of camera {self._spec.serial}") as error:
+            with errors(f"stream of camera {self._spec.serial}", REACH) as error:
                 self._stream = self._library.arv_camera_create_stream(self._camera, None, None, error)
             assert self._stream is not None
             self._parameters.furnish(self._stream, usual_parameters(found.height / self._spec.line_rate_hz))
@@ -127,7 +128,7 @@ class AravisCamera:
         library, found = self._library, self._format()
         self._missed = MissedTriggers(self.features())
         what = f"arm camera {self._spec.serial}"
-        with errors(what) as error:
+        with errors(what, REACH) as error:
             self._payload = library.arv_camera_get_payload(self._camera, error)
         # USB3 Vision has frame IDs of 64 bits that do not skip 0; in GigE Vision they skip it.
         bits, skips_zero = 64, False
@@ -141,7 +142,7 @@ class AravisCamera:
         self._assembly = Assembly(found, spec, buffers, skips_zero)
         self._packets = 1
         if library.arv_camera_is_gv_device(self._camera):
-            with errors(what) as error:
+            with errors(what, REACH) as error:
                 size = library.arv_camera_gv_get_packet_size(self._camera, error)
             # A frame that finds no buffer is counted once for each of its packets, of which two more, leader
             # and trailer, have no lines.
@@ -152,7 +153,7 @@ class AravisCamera:
         # Set before the start, so that a start that fails half-way is stopped as well.
         self._armed = True
         enlarge_sockets()
-        with errors(what) as error:
+        with errors(what, REACH) as error:
             library.arv_camera_start_acquisition(self._camera, error)
         self._heard_s = time.monotonic()
 
@@ -193,7 +194,7 @@ class AravisCamera:
         try:
             missed = self._missed.count()
         except CameraError as error:
-            raise CameraLostError(f"camera {self._spec.serial} is gone: {error.message}") from error
+            raise self._gone(error.message) from error
         counts = c_uint64(), c_uint64(), c_uint64()
         self._library.arv_stream_get_statistics(self._stream, *map(byref, counts))
         # Of completed, failed and starved buffers. Rounded up: a frame may be counted only in part so far.
@@ -224,6 +225,10 @@ class AravisCamera:
         # Aravis does not report how much of an incomplete frame has arrived.
         return Frame(buffer, memory, size.value if complete else self._payload, facts, complete)
 
+    def _gone(self, why: str) -> CameraLostError:
+        what = f"camera {self._spec.serial} is gone: {why}"
+        return CameraLostError(what, hint="check its cable and power, then arm again")
+
     def _check_alive(self) -> None:
         """Raise CameraLostError if the silent camera is gone, or was away for a moment.
 
@@ -236,12 +241,12 @@ class AravisCamera:
         try:
             self._format()
         except CameraError as error:
-            raise CameraLostError(f"camera {self._spec.serial} is gone: {error.message}") from error
+            raise self._gone(error.message) from error
         library = self._library
         if library.arv_camera_is_gv_device(self._camera) and not library.arv_gv_device_is_controller(
             self._device
         ):
-            raise CameraLostError(f"camera {self._spec.serial} is gone: it has restarted")
+            raise self._gone("it has restarted")
 
     def release(self, block: CameraBlock) -> None:
         # None of a block from before `disarm`, which has freed it.
@@ -312,6 +317,13 @@ def _check_identity(found: CameraIdentity, spec: GenicamSpec) -> None:
     # An address may have been given to another camera, and swapped cameras would be noticed only in the
     # video.
     if found.serial != spec.serial:
-        raise CameraError(f"the camera at {spec.cti} has serial number {found.serial!r}, not {spec.serial!r}")
+        raise CameraError(
+            f"the camera at {spec.cti} has serial number {found.serial!r}, not {spec.serial!r}",
+            hint="change serial in the camera's table, or its cti, the address; acquire"
+            " devices lists the cameras",
+        )
     if spec.model and found.model != spec.model:
-        raise CameraError(f"camera {spec.serial} is a {found.model!r}, not a {spec.model!r}")
+        raise CameraError(
+            f"camera {spec.serial} is a {found.model!r}, not a {spec.model!r}",
+            hint="change model in the camera's table, or serial, if another camera is meant",
+        )

@@ -22,6 +22,7 @@ from acquire.cli.demo.plan import (
 from acquire.cli.durations import seconds
 from acquire.cli.journal import Journal
 from acquire.cli.output import JsonFlag, print_facts, print_json
+from acquire.cli.places import make_directory
 
 
 def register(app: typer.Typer) -> None:
@@ -102,7 +103,7 @@ def demo(
     from acquire.evaluate.summary import summarise
 
     # Fails if it was made since the check: nobody else's directory is filled.
-    plan.out.mkdir()
+    make_directory(plan.out)
     journal = Journal()
     if rig.trigger.driver == "rtl":
         compile_gateware(rig, journal)

@@ -81,7 +81,10 @@ def _compile(found: str, target: Path) -> None:
                 hint="a machine that is less busy, or CC in the environment for another compiler",
             ) from error
         if done.returncode:
-            raise DeviceError(f"{found} failed to compile the producer: {done.stderr.strip()[-2000:]}")
+            raise DeviceError(
+                f"{found} failed to compile the producer: {done.stderr.strip()[-2000:]}",
+                hint="CC in the environment for another compiler",
+            )
         made.replace(target)
 
 

@@ -231,5 +231,8 @@ def _bound(host: str, *, shared: bool) -> socket.socket:
         control.bind((host, protocol.PORT))
     except OSError as error:
         control.close()
-        raise DeviceError(f"the GigE Vision camera cannot be opened on {host}: {error.strerror}") from error
+        raise DeviceError(
+            f"the GigE Vision camera cannot be opened on {host}: {error.strerror}",
+            hint="another address of this host; a program that uses UDP port 3956 there has to end",
+        ) from error
     return control

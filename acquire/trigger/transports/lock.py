@@ -30,7 +30,10 @@ class PortLock:
         try:
             self._lock = LockFile(path, _FOR_ALL)
         except OSError as error:
-            raise TriggerError(f"{port} cannot be locked: {path}: {error.strerror}") from error
+            raise TriggerError(
+                f"{port} cannot be locked: {path}: {error.strerror}",
+                hint="the permissions of that file; it can be deleted while no program uses the port",
+            ) from error
         try:
             self._lock.take(_LOOKED_AT_S)
         except BlockingIOError as error:
@@ -41,7 +44,10 @@ class PortLock:
             ) from error
         except OSError as error:
             self.release()
-            raise TriggerError(f"{port} cannot be locked: {path}: {error.strerror}") from error
+            raise TriggerError(
+                f"{port} cannot be locked: {path}: {error.strerror}",
+                hint="the permissions of that file; it can be deleted while no program uses the port",
+            ) from error
 
     def release(self) -> None:
         """Release the lock. Idempotent."""

@@ -93,7 +93,11 @@ class SerialTransport:
         try:
             self._port.write(data)
         except serial.SerialTimeoutException as error:
-            raise TriggerError(f"{self.name} took no byte for {_WRITE_S:g} s") from error
+            raise TriggerError(
+                f"{self.name} took no byte for {_WRITE_S:g} s",
+                hint="check cable and power, and trigger.flow_control:"
+                " 'rts-cts' needs both lines of the board",
+            ) from error
         except OSError as error:
             raise self._gone(error) from error
 

@@ -96,12 +96,16 @@ class UsbTransport:
         try:
             sent = self._out.write(data, round(_WRITE_S * 1000))
         except usb.core.USBTimeoutError as error:
-            raise TriggerError(f"{self.name} took no byte for {_WRITE_S:g} s") from error
+            raise TriggerError(
+                f"{self.name} took no byte for {_WRITE_S:g} s", hint="check cable and power, then arm again"
+            ) from error
         except usb.core.USBError as error:
             raise self._gone(error) from error
         # A transfer may end short without an error; the rest, sent later, would not be a frame.
         if sent != len(data):
-            raise TriggerError(f"{self.name} took {sent} of {len(data)} bytes")
+            raise TriggerError(
+                f"{self.name} took {sent} of {len(data)} bytes", hint="check cable and power, then arm again"
+            )
 
     def close(self) -> None:
         # Also a device that was opened and could not be claimed: its handle would stay.
@@ -135,7 +139,10 @@ class UsbTransport:
             if len(ways) == 2:
                 usb.util.claim_interface(self._device, interface.bInterfaceNumber)
                 return ways[_IN], ways[usb.util.ENDPOINT_OUT]
-        raise TriggerError(f"{self.name} has no interface with a bulk endpoint in each direction")
+        raise TriggerError(
+            f"{self.name} has no interface with a bulk endpoint in each direction",
+            hint="load the firmware that belongs to this program",
+        )
 
     def _gone(self, error: usb.core.USBError) -> TriggerError:
         what = "was unplugged" if error.errno == errno.ENODEV else "failed"

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from waiting import until
 
 import acquire.sim.rtl
+from acquire import __version__
 from acquire.cli.demo.capture import record
 from acquire.cli.demo.plan import DemoPlan, trigger_settings
 from acquire.cli.journal import Journal
@@ -162,8 +163,10 @@ def test_without_a_compiler_the_rig_says_what_to_install(
     with pytest.raises(UsageError, match=r"which needs g\+\+ \(Debian, Ubuntu: apt install g\+\+\)"):
         RtlTransport(CLOCK_HZ)
     monkeypatch.setattr(acquire.sim.rtl, "ROOT", tmp_path)
-    with pytest.raises(UsageError, match="which are in a checkout"):
+    with pytest.raises(UsageError, match="which are in a checkout") as caught:
         RtlTransport(CLOCK_HZ)
+    assert "'simulated'" in caught.value.possible
+    assert f"tdi-acquire=={__version__}" in caught.value.hint  # an installed package states how to get them
 
 
 def test_a_cache_that_cannot_be_written_is_named(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
