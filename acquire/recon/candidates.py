@@ -66,9 +66,10 @@ class Candidate:
             return FrameTv(10)
         if self.prior == "smooth":
             return Smooth(self.pace)
+        cyclic = self.prior == "cycle"
         if self.ground:
-            return GroundedTv(self.pace, self.ground)
-        return VolumeTv(self.pace, cyclic=self.prior == "cycle")
+            return GroundedTv(self.pace, self.ground, cyclic=cyclic)
+        return VolumeTv(self.pace, cyclic=cyclic)
 
     def basis(self, frames: int, arrays: Arrays) -> TemporalBasis | CyclicBasis:
         """The temporal basis of its coefficients."""
@@ -118,7 +119,7 @@ class Candidate:
             yield partial(Candidate.with_pace, factor=by)
         for step in (1, -1):
             yield partial(Candidate.with_coefficients, step=step, frames=frames)
-        if self.prior == "volume":
+        if self.prior in ("volume", "cycle"):
             for by in (1 / WEIGHT_STEP, WEIGHT_STEP) if self.ground else (GROUND,):
                 yield partial(Candidate.with_ground, factor=by)
 

@@ -1,7 +1,8 @@
 """The default solver: it chooses the prior that predicts the held-out blocks best, then uses all samples.
 
     still      one frame, total variation                         for rest, or light too weak for more
-    volume     few cosines, total variation of a volume           for motion; also times a free brightness
+    volume     few cosines, total variation of a volume           for motion; also before a still ground, and
+                                                                  times a free brightness
     cycle      harmonics of a period, total variation of a cycle  for motion that repeats
     smooth     few cosines, quadratic in second differences       for flow
     cosines    the whole band, total variation of coefficients    for lamps, then as patterns and curves

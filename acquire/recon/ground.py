@@ -30,8 +30,8 @@ class GroundedTv(VolumeTv):
     solver's iterations are theirs, too.
     """
 
-    def __init__(self, pace: float, ground: float) -> None:
-        super().__init__(pace)
+    def __init__(self, pace: float, ground: float, *, cyclic: bool = False) -> None:
+        super().__init__(pace, cyclic=cyclic)
         self.ground = ground
         self._still_tv = FrameTv(ITERATIONS)
         self._still: Array = None

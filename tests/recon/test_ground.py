@@ -8,7 +8,7 @@ import pytest
 
 from acquire.evaluate.metrics import psnr
 from acquire.recon import choose, reconstruct
-from acquire.recon.candidates import GROUND, GROUNDED, VOLUME, Candidate
+from acquire.recon.candidates import CYCLE, GROUND, GROUNDED, STILL, VOLUME, Candidate
 from acquire.recon.ground import GroundedTv
 from acquire.recon.tv import FrameTv
 from acquire.recon.volume import VolumeTv
@@ -79,11 +79,12 @@ def test_another_trial_goes_on_from_where_one_ended() -> None:
     np.testing.assert_array_equal(second.prox(theta, WEIGHT), first.prox(theta, WEIGHT))
 
 
-def test_a_search_finds_a_ground_for_any_volume() -> None:
+def test_a_search_finds_a_ground_for_any_volume_and_cycle() -> None:
     def reached(candidate: Candidate) -> set[float]:
         return {each.ground for step in candidate.steps(200) if (each := step(candidate)) is not None}
 
-    assert reached(VOLUME) == {0.0, GROUND}
+    assert reached(VOLUME) == reached(CYCLE) == {0.0, GROUND}
+    assert reached(STILL) == {0.0}
     assert reached(GROUNDED) == {GROUND, 0.0316, 0.316}
     assert VOLUME.is_stronger_than(GROUNDED)
     heavier = GROUNDED.with_ground(3)
