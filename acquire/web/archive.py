@@ -120,7 +120,7 @@ class Archive:
         """Return a recording with its events, gaps and holds. Raises PlaceError and DataError."""
         path = self.path_of(name)
         opened = open_recording(path)
-        # A damaged table is told as damage, and the rest is shown.
+        # A damaged table is reported as damage, and the rest is shown.
         events = () if "events" in opened.unreadable else opened.events[-MOST_EVENTS:]
         gaps = () if "gaps" in opened.unreadable else opened.gaps[-MOST_EVENTS:]
         return RecordingDetail(

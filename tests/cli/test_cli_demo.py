@@ -55,7 +55,7 @@ def test_rigs_that_show_too_little(cli: Cli, tmp_path: Path, before: str, after:
 def test_the_parent_directory_must_exist(cli: Cli, tmp_path: Path) -> None:
     answer = cli("demo", "--out", tmp_path / "none" / "new")
     assert answer.code == 2
-    assert f"no directory {tmp_path / 'none'}" in answer.err
+    assert f"{tmp_path / 'none'} does not exist" in answer.err
 
 
 def test_the_report_contains_the_equivalent_command() -> None:

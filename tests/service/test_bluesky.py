@@ -270,7 +270,7 @@ def test_a_fault_and_a_foreign_stop_fail_the_status_with_an_explanation(
             client.stop()
         return bps.null()
 
-    assert re.search(r"has \d+ of 6000000 lines: stopped$", in_words(engine, fly(recorder, long, stop)))
+    assert re.search(r"has \d+ of 6000000 lines: stopped; try: ", in_words(engine, fly(recorder, long, stop)))
 
     def lose_the_directory() -> Any:
         until_committed(daemon)

@@ -153,7 +153,8 @@ def test_a_disk_that_ends_the_recording_is_a_fault(start: Start) -> None:
         assert str(status.fault).startswith("the recording was aborted: write error: ")
         assert "possible" not in str(status.fault)
         assert status.last is not None
-        assert status.last.condition == "ABORTED"
+        # It is recovered then, from arm B.
+        assert status.last.condition in ("ABORTED", "INTERRUPTED")
         assert client.disarm().state is State.IDLE
 
 
