@@ -35,7 +35,7 @@ from acquire.recon.blinking import (
     solve_in_cosines,
 )
 from acquire.recon.candidates import CALM, GROUNDED, SMOOTH, STILL, VOLUME
-from acquire.recon.cycle import find_period
+from acquire.recon.cycle import TRIED_CHANGES, find_period
 from acquire.recon.estimates import Preferred, Refined
 from acquire.recon.given import Given
 from acquire.recon.holdout import HeldOut
@@ -142,7 +142,9 @@ def _choose(bench: Workbench, volume: Trial, trials: int) -> Estimate:
         # The first cosine is constant, so that this is the video's mean over time.
         picture = (cosines.basis.matrix()[0, 0] * host(cosines.solver.theta[0, ...])).clip(0)
         tried.bright = bench.brighten(picture, cosines.basis.cosines, min(at_a_glance, tried.best.error))
-    repeats = None if clear else find_period(cosines.solver.theta, cosines.basis)
+    # Evident lamps need this time for themselves, too, which is 3 % of 10 s.
+    rises = (0.0,) if lamps else TRIED_CHANGES
+    repeats = None if clear else find_period(cosines.solver.theta, cosines.basis, rises)
     if repeats is not None and not clock.spent(SEARCH_SHARE):
         rival = min(at_a_glance, tried.best.error)
         cycle = bench.repeat(*repeats, rival)

@@ -60,10 +60,12 @@ def most_harmonics(period_frames: float, speed_changes: Sequence[float] = ()) ->
     return int(SHARE_OF_NYQUIST * period_frames / speed_range(speed_changes)[1] / 2)
 
 
-def find_period(theta: Array, basis: Basis) -> tuple[float, tuple[float, ...]] | None:
+def find_period(
+    theta: Array, basis: Basis, rises: Sequence[float] = TRIED_CHANGES
+) -> tuple[float, tuple[float, ...]] | None:
     """The mean period in frames and the changes of speed of a video of coefficients θ (K, n′, n′).
 
-    Returns None if nothing repeats.
+    Its speed rises by one of ``rises``. Returns None if nothing repeats.
     """
     last = (basis.cosines - 1) / 2  # cosine k of the span is k/2 cycles in it
     tried = np.arange(round(FEWEST_CYCLES / STEP), int(last / FEWEST_HARMONICS / STEP))
@@ -76,7 +78,7 @@ def find_period(theta: Array, basis: Basis) -> tuple[float, tuple[float, ...]] |
     most = energies > NEGLIGIBLE * change
     # These are the courses in which the video changes, at instants that are enough for its cosines.
     courses = basis.matrix(2 * basis.cosines)[1:].T @ (axes[:, most] * energies[most] ** 0.5)
-    combs = np.stack([_comb(courses, tried, last, rise) / change for rise in TRIED_CHANGES])
+    combs = np.stack([_comb(courses, tried, last, rise) / change for rise in rises])
     chance = 2 * np.minimum(last // (tried * STEP), MOST_HARMONICS) / (basis.count - 1)
     combs = (combs - chance) / np.maximum(1 - chance, STEP)
     best = combs.max(0)
@@ -86,7 +88,7 @@ def find_period(theta: Array, basis: Basis) -> tuple[float, tuple[float, ...]] |
         return None
     near = np.flatnonzero(np.abs(tried - tried[good[-1]]) * STEP <= LOBE)
     which, cycles = np.unravel_index(combs[:, near].argmax(), (len(combs), len(near)))
-    period, rise = basis.frames / (STEP * float(tried[near[cycles]])), TRIED_CHANGES[which]
+    period, rise = basis.frames / (STEP * float(tried[near[cycles]])), rises[which]
     return period, (rise,) if rise else ()
 
 
