@@ -123,8 +123,7 @@ class Recorder:
         self._commit_s = 0.0
         self._waits = DiskWaits(counters)
         self._hold_ups = HoldUps()
-        self._cut_short = False
-        self._waited_in_vain_for = -1
+        self._cut_short, self._waited_in_vain_for = False, -1
         shape = rings[ARMS[0]].shape
         self._blank = np.zeros((shape.rows, shape.width), shape.dtype)
         self._waiting = select.poll()
@@ -465,18 +464,19 @@ class Recorder:
     # ---- the current recording
 
     def _update(self, session: Session) -> None:
-        session.doubted = self._external.doubted()
+        session.doubted, session.verified = self._external.doubted(), self._external.verified()
         session.trigger, session.cameras = self._external.trigger(), self._external.cameras()
-        session.verified = self._external.verified()
+        looked_s = time.monotonic()
         for name, arm in self._arms.items():
             # Once more: an arm whose lines came while the disk held up this loop is not silent.
-            arm.watch(time.monotonic(), self._counters[f"awaited_{name}"])
+            arm.watch(looked_s, self._counters[f"awaited_{name}"])
             if name in session.lost and not arm.ring.fill:
                 session.give_up(name)
         if session.done:
             self._close(session)
             return
-        stall = find_stall(session, self._arms, self._plan.stall_timeout_s, self._plan.max_skew_lines)
+        limits = self._plan.stall_timeout_s, self._plan.max_skew_lines
+        stall = find_stall(session, self._arms, looked_s, *limits)
         if stall is not None:
             session.lost.update(dict.fromkeys(stall.arms, Cause.STALLED))
             session.end(self._common_line(), stall.reason, stall.condition)

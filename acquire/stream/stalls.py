@@ -199,13 +199,18 @@ class Excess:
         return line if now_s - self._since_s > self._limit_s else 0
 
 
-def find_stall(session: Session, arms: dict[str, Arm], limit_s: float, max_skew_lines: int) -> Stall | None:
-    """Return the stall that ends the recording, or None; arms given up already do not count again."""
+def find_stall(
+    session: Session, arms: dict[str, Arm], looked_s: float, limit_s: float, max_skew_lines: int
+) -> Stall | None:
+    """Return the stall that ends the recording, or None; arms given up already do not count again.
+
+    ``looked_s``: the time before the arms were looked at last. A process that was stopped after that look
+    does not know what came since, and must not take its own pause for the arms' silence.
+    """
     waited_for = [name for name in ARMS if not session.reached(name) and name not in session.lost]
     if not waited_for:
         return None
-    now_s = time.monotonic()
-    silent_s = {name: now_s - arm.alive_s for name, arm in arms.items()}
+    silent_s = {name: looked_s - arm.alive_s for name, arm in arms.items()}
     if any(silent_s[name] > limit_s for name in waited_for):
         # Arms that fall silent together do so to within a block: half the limit distinguishes both from one.
         silent = tuple(name for name in ARMS if silent_s[name] > limit_s / 2)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import os
+import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future
 from pathlib import Path
@@ -27,6 +28,7 @@ from acquire.stream.recorder import Recorder
 from acquire.stream.recorder_plan import COUNTERS, RecorderPlan
 from acquire.stream.recorder_states import RecorderEvent, RecorderState
 from acquire.stream.ring import Ring, RingShape
+from acquire.stream.stalls import find_stall
 from acquire.stream.window import NOW, Window
 from acquire.trigger.base import TriggerRun
 
@@ -77,6 +79,8 @@ class SlowDisk:
 class Bed:
     """A recorder between rings that the test fills and a disk that the test moves."""
 
+    stall_timeout_s = 60.0
+
     def __init__(self) -> None:
         self.losses = {arm: LossLog() for arm in ARMS}
         self.rings = {arm: Ring(arm, RingShape(SLOTS, ROWS, PIXELS, "uint16")) for arm in ARMS}
@@ -84,7 +88,9 @@ class Bed:
         self.counters = Counters(COUNTERS)
         self.post = Post()
         self.disk = SlowDisk()
-        plan = RecorderPlan(RUN, STAGES, stall_timeout_s=60.0, tag_wait_s=0.0, max_skew_lines=10_000)
+        plan = RecorderPlan(
+            RUN, STAGES, stall_timeout_s=self.stall_timeout_s, tag_wait_s=0.0, max_skew_lines=10_000
+        )
         self.recorder = Recorder(
             self.post,
             plan,
@@ -349,6 +355,28 @@ def test_a_ring_that_overflows_ends_the_recording_before_the_line(
         assert (bed.counters[f"stored_{arm}"], bed.counters[f"overrun_{arm}"]) == (recording.lines, 0)
         assert recording.camera(arm).lines[:, 0].tolist() == list(range(first_line, full_at))
     assert bed.counters[f"discarded_{other}"] == first_line + 2 * ROWS
+
+
+def test_a_recorder_that_is_stopped_does_not_take_its_own_pause_for_the_arms_silence(
+    bed: Bed, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Not even if it is stopped after its last look at the rings, right before it judges the arms."""
+    bed.begin(tmp_path / "r.zarr")
+    pause_s = bed.stall_timeout_s + 1.0
+
+    def stopped(*args: Any) -> Any:
+        monkeypatch.setattr("time.monotonic", lambda now=time.monotonic: now() + pause_s)
+        for arm in ARMS:
+            bed.offer(arm, bed.line)
+        return find_stall(*args)
+
+    monkeypatch.setattr("acquire.stream.recorder.find_stall", stopped)
+    bed.recorder.turn()
+    monkeypatch.setattr("acquire.stream.recorder.find_stall", find_stall)
+    bed.line += ROWS
+    bed.lines()
+    bed.post.waiting.append(End("stopped", bed.line))
+    assert bed.sealed().end_reason == "stopped"
 
 
 def test_a_recording_begins_after_what_found_the_rings_full(bed: Bed, tmp_path: Path) -> None:

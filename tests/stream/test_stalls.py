@@ -52,7 +52,7 @@ def test_silent_arms_are_named(
     arms: dict[str, Arm], a: float, b: float, stalled: tuple[str, ...] | None
 ) -> None:
     silence(arms, a, b)
-    found = find_stall(make(), arms, LIMIT_S, SKEW)
+    found = find_stall(make(), arms, time.monotonic(), LIMIT_S, SKEW)
     assert (found and found.arms) == stalled
     if found is not None:
         both = len(found.arms) == 2
@@ -62,17 +62,17 @@ def test_silent_arms_are_named(
 
 def test_an_arm_that_has_all_its_lines_or_is_given_up_is_not_waited_for(arms: dict[str, Arm]) -> None:
     silence(arms, LIMIT_S * 2, 0.0)
-    assert find_stall(make(lines=100), arms, LIMIT_S, SKEW) is None
+    assert find_stall(make(lines=100), arms, time.monotonic(), LIMIT_S, SKEW) is None
     session = make()
     session.lost["a"] = Cause.STALLED
-    assert find_stall(session, arms, LIMIT_S, SKEW) is None
+    assert find_stall(session, arms, time.monotonic(), LIMIT_S, SKEW) is None
 
 
 def test_an_arm_that_lags_too_far_is_named(arms: dict[str, Arm]) -> None:
     session = make()
     assert session.skew == 20
     session.take("a", ring_block("a", 100, SKEW))
-    found = find_stall(session, arms, LIMIT_S, SKEW)
+    found = find_stall(session, arms, time.monotonic(), LIMIT_S, SKEW)
     assert found is not None
     assert (found.arms, found.condition) == (("b",), RunCondition.INCOMPLETE)
     assert f"{SKEW + 20} lines behind" in found.reason
