@@ -180,23 +180,25 @@ class Excess:
     """Detects an arm that counts lines which the trigger has not issued, and so is not triggered by it.
 
     Tags come in steps and late, on a busy host by seconds: only an excess of more than ``margin_lines`` for
-    longer than ``limit_s`` counts.
+    longer than ``limit_s`` counts. A host that did not let this process run for seconds leaves it behind with
+    the tags: time between two calls counts up to `_LONGEST_LOOK_S`.
     """
 
     def __init__(self, counters: Counters, margin_lines: int, limit_s: float) -> None:
         self._counters = counters
         self._margin_lines = margin_lines
         self._limit_s = limit_s
-        self._since_s: float | None = None
+        self._looked_s = time.monotonic()
+        self._ahead_s = 0.0
 
     def update(self, newest_pulse: int, now_s: float) -> int:
         """Return the arm's next line if it is impossible, else 0; ``newest_pulse``: the latest tag's line."""
+        self._ahead_s += min(now_s - self._looked_s, _LONGEST_LOOK_S)
+        self._looked_s = now_s
         line = self._counters["next_line"]
         if line <= newest_pulse + self._margin_lines:
-            self._since_s = None
-            return 0
-        self._since_s = self._since_s or now_s
-        return line if now_s - self._since_s > self._limit_s else 0
+            self._ahead_s = 0.0
+        return line if self._ahead_s > self._limit_s else 0
 
 
 def find_stall(

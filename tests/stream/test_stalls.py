@@ -13,7 +13,7 @@ from acquire.store import RunCondition
 from acquire.stream.losses import Cause
 from acquire.stream.ring import Ring, RingShape
 from acquire.stream.session import Session
-from acquire.stream.stalls import HELD_UP_S, Arm, Heartbeat, HoldUps, find_stall
+from acquire.stream.stalls import HELD_UP_S, Arm, Excess, Heartbeat, HoldUps, find_stall
 
 LIMIT_S, SKEW = 10.0, 1000
 
@@ -119,6 +119,21 @@ def test_a_counter_that_stands_still_shows_no_life(counters: Counters) -> None:
 def test_the_watchers_own_absence_is_not_held_against_the_watched(counters: Counters) -> None:
     heart = Heartbeat(counters, "beats")
     assert heart.update(time.monotonic() + 1000) < 1
+
+
+def test_a_camera_ahead_of_the_trigger_is_told_but_not_from_a_pause_of_the_watcher() -> None:
+    counters = Counters(("next_line",))
+    try:
+        counters["next_line"] = 1000
+        now_s, excess = time.monotonic(), Excess(counters, 100, 3.0)
+        assert excess.update(899, now_s + 0.1) == 0
+        # The tags are unread, too, of a time in which this process did not run.
+        assert excess.update(899, now_s + 60.0) == 0
+        assert excess.update(900, now_s + 60.1) == 0
+        found = [excess.update(899, now_s + 60.1 + 0.3 * k) for k in range(1, 12)]
+        assert found == [0] * 10 + [1000]
+    finally:
+        counters.close()
 
 
 def test_a_hold_up_counts_until_lines_that_came_after_it_are_taken(monkeypatch: pytest.MonkeyPatch) -> None:
