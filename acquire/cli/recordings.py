@@ -113,7 +113,8 @@ def info(recording: PlaceArgument, json: JsonFlag = False) -> None:
 def verify(recording: PlaceArgument, json: JsonFlag = False) -> None:
     """Read a whole recording and check that every line is intact, and that numbering, gaps and ledger agree.
 
-    If lines are lost or damaged, the command lists them and the exit code is 6.
+    If something is damaged, the command lists it and the exit code is 6. Lines that are flagged as missing
+    are no damage: they were lost before, or recover has flagged them, and info lists them.
 
     Example: [bold]acquire verify run.zarr[/]
     """
@@ -124,11 +125,12 @@ def verify(recording: PlaceArgument, json: JsonFlag = False) -> None:
     if json:
         print_json(found.to_dict())
     else:
-        verdict = "intact" if found.intact else "DAMAGED"
+        verdict = "DAMAGED" if not found.intact else "recovered" if found.recovered else "intact"
         size = quantity(found.bytes, "B")
         say(f"{found.path}: {verdict}; {found.state}, {found.lines} lines, {size}")
         # Lists end after `LISTED` items: a recording on a failing disk may have thousands.
         _print_list("not intact on disk", map(str, found.damage))
+        _print_list("lost, flagged as missing", map(str, found.recovered))
         _print_list("contradictions", found.contradictions)
         _print_list("note", found.notes)
     if not found.intact:
@@ -161,6 +163,7 @@ def recover(recording: RecordingArgument, json: JsonFlag = False) -> None:
         say(f"  it is not listed in the first recording of its run: {done.not_listed}")
     if done.indices_mended:
         say(f"  {done.indices_mended} file indices were repaired")
+    _print_list("lost of a table", done.tables_lost.values())
     _print_list("lost, flagged as missing", map(str, done.damage))
 
 

@@ -131,6 +131,8 @@ def _salvage(mailbox: Mailbox, task: Task) -> RecoveryStatus:
     text = str(sealed["end_reason"])
     if done.lines < task.committed_lines:
         text += f"; of {task.committed_lines} acknowledged lines only {done.lines} are on disk"
+    for lost in done.tables_lost.values():
+        text += f"; {lost}"
     if done.not_listed:
         text += f"; not listed in its first recording: {done.not_listed}"
     return RecoveryStatus(

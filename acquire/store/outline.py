@@ -19,7 +19,7 @@ from acquire.store.attributes import size_limit_bytes
 from acquire.store.files import DISK, is_locked
 from acquire.store.opening import opened
 from acquire.store.source import LocalSource, source_of
-from acquire.store.table_reader import read_events, read_gaps
+from acquire.store.table_reader import read_events, read_gaps, salvage_events
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -202,6 +202,16 @@ class Outline:
                 found[name] = error.message.removeprefix(f"{self}: ")
         return found
 
+    def salvaged_events(self) -> tuple[tuple[Event, ...], list[str]]:
+        """Return the events of a damaged table as far as they can be read, and what is wrong with it."""
+        return salvage_events(self.source, self._nodes)
+
+    @property
+    def tables_lost(self) -> dict[str, str]:
+        """Tables, ``gaps`` or ``events``, of which a recovery could not read all, and what it lost."""
+        lost = self.attrs.get("tables_lost")
+        return {str(name): str(text) for name, text in lost.items()} if isinstance(lost, dict) else {}
+
     def info(self) -> dict[str, Any]:
         """Return a summary of the recording, as JSON; without the facts of a table that is `unreadable`."""
         period_ns, lines = self.line_period_ns, self.lines
@@ -230,6 +240,7 @@ class Outline:
             if gaps is None
             else {arm: sum(gap.count for gap in gaps if gap.arm == arm) for arm in ARMS},
             "events": None if "events" in self.unreadable else len(self.events),
+            "tables_lost": self.tables_lost,
             "simulated": bool(self.attrs.get("simulated", False)),
             "cameras": self.attrs["cameras"],
             "imported": self.attrs.get("imported"),

@@ -65,6 +65,7 @@ def write_copy(publisher: Publisher, path: Path, attributes: dict[str, Any], *, 
 def rebuild_root(path: Path, disk: Disk) -> None:
     """Rebuild the root of the recording at ``path``; one that cannot be read is kept under another name.
 
+    Tables whose metadata are lost are empty, and named in ``tables_lost``.
     Raises DataError, and changes nothing, if too much is lost.
     """
     attributes = known_attributes(path)
@@ -74,12 +75,19 @@ def rebuild_root(path: Path, disk: Disk) -> None:
             possible=f"the arrays of {' and '.join(ARMS)} can be read with zarr; nothing was touched",
             hint="a copy of the recording, or of its zarr.json",
         )
-    nodes = _arms(path, attributes) | gap_table(path).nodes() | event_table(path).nodes()
+    tables = {"gaps": gap_table(path).nodes(), "events": event_table(path).nodes()}
+    nodes = _arms(path, attributes) | tables["gaps"] | tables["events"]
     # Tables and overview as far as they exist, since the lines do not depend on them.
-    for keys in (gap_table(path).nodes(), event_table(path).nodes(), overview.KEYS):
+    lost: dict[str, str] = {}
+    for name, keys in (*tables.items(), (overview.NAME, overview.KEYS)):
         own = {key: _own(path / key) for key in keys}
         if all(own.values()):
             nodes |= {key: layout.inner(document) for key, document in own.items() if document}
+        elif name in tables:
+            key = next(key for key, document in own.items() if not document)
+            lost[name] = f"table {name} is lost: {key}/zarr.json cannot be read"
+    if lost:
+        attributes = {**attributes, "tables_lost": lost}
     try:
         if (path / ROOT).exists():
             disk.rename(path / ROOT, path / DAMAGED_ROOT)

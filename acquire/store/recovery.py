@@ -6,8 +6,9 @@
 
 No committed line is cut off: lines of which a part is not on disk stay, flagged as missing and listed in
 gaps. Whole chunks that were written after the last commit are added; pixels without tags are no lines, and
-stay where they are, after the last line. A second run finds nothing to do; an interrupted one is simply
-repeated, since the root is written last.
+stay where they are, after the last line. Gaps of a table that cannot be read are listed anew from the flags,
+without their causes; events of which a column cannot be read lose what was in it. A second run finds nothing
+to do; an interrupted one is simply repeated, since the root is written last.
 
 If the machine has kept running, committed lines are certainly on disk: then only the chunks after the last
 commit are checked, which takes a moment however long the recording is.
@@ -17,7 +18,7 @@ from __future__ import annotations
 
 import contextlib
 import copy
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from itertools import product
 from typing import TYPE_CHECKING, Any
 
@@ -95,6 +96,7 @@ class Recovery:
     indices_mended : number of files whose index was torn, or lacked chunks
     damage : lost lines, of which array and why
     root_rebuilt : the root's zarr.json was lost, and rebuilt from the metadata of the parts below it
+    tables_lost : table, ``gaps`` or ``events``, that could not be read → what of it is lost
     not_listed : why the segments of the run could not be listed in its first recording; "" if they could
     """
 
@@ -106,6 +108,7 @@ class Recovery:
     damage: tuple[Damage, ...]
     root_rebuilt: bool = False
     not_listed: str = ""
+    tables_lost: dict[str, str] = field(default_factory=dict)
 
     def to_dict(self) -> dict[str, Any]:
         return asdict(self)
@@ -131,7 +134,7 @@ def recover(
         if lost := root_is_lost(path):
             rebuild_root(path, disk)
         recording = open_recording(path)  # once more, now that nobody writes it
-        done = _Recoverer(recording, path, disk, known).run(progress)
+        done = _Recoverer(recording, path, disk, known, rebuilt=lost).run(progress)
     not_listed = ""
     # Without the lock: `list_segments` takes that of the run's first recording, which this may be.
     try:
@@ -145,7 +148,9 @@ def recover(
 class _Recoverer:
     """One recovery, with the recording locked."""
 
-    def __init__(self, recording: Recording, path: Path, disk: Disk, known: Circumstances) -> None:
+    def __init__(
+        self, recording: Recording, path: Path, disk: Disk, known: Circumstances, *, rebuilt: bool
+    ) -> None:
         self.recording = recording
         self.path = path
         self.disk = disk
@@ -156,7 +161,15 @@ class _Recoverer:
         self.flags_changed = 0
         self.shape = recording.arms[ARMS[0]].reader("lines").shape
         self.tag_rows = tag_rows(recording)
-        trusted = known.committed_intact and not self.sealed
+        self.events = () if "events" in recording.unreadable else recording.events
+        self.gaps = () if "gaps" in recording.unreadable else recording.gaps
+        # What an unsealed one has lost already is from a rebuilding of its root, whose recovery may have been
+        # interrupted.
+        noted = recording.tables_lost if rebuilt or not self.sealed else {}
+        self.tables_lost = {**noted, **recording.unreadable}
+        self.gaps_lost = "gaps" in self.tables_lost
+        # Gaps that cannot be read are listed from the flags of all rows.
+        trusted = known.committed_intact and not self.sealed and not self.gaps_lost
         self.first_row = recording.lines // self.tag_rows * self.tag_rows if trusted else 0
         """Rows before this one are known to be intact."""
         kept = [range(max(rows.start, self.first_row), rows.stop) for rows in recording.kept_rows()]
@@ -187,7 +200,10 @@ class _Recoverer:
                 self.rows += grown
         damage = tuple(found for arm in scans.values() for found in arm.damages(recording.lines))
         new_gaps = {arm: self._flag(found) for arm, found in scans.items()}
-        changed = bool(not self.sealed or mended or self.flags_changed or any(new_gaps.values()))
+        if self.tables_lost:
+            self._salvage_tables(new_gaps)
+        repaired = mended or self.flags_changed or any(new_gaps.values()) or self.tables_lost
+        changed = bool(not self.sealed or repaired)
         if changed:
             self._publish(new_gaps)
         lines = open_recording(self.path).lines
@@ -198,12 +214,29 @@ class _Recoverer:
             lines_before=recording.lines,
             indices_mended=mended,
             damage=damage,
+            tables_lost=self.tables_lost,
         )
+
+    def _salvage_tables(self, new_gaps: dict[str, list[tuple[int, int, str]]]) -> None:
+        """Take from the tables that cannot be read what is whole, and note what is lost."""
+        if "events" in self.recording.unreadable:
+            self.events, wrong = self.recording.salvaged_events()
+            kept = f"{len(self.events)} events were kept without it" if self.events else "no event was kept"
+            self.tables_lost["events"] = f"{'; '.join(wrong)}; {kept}"
+        if self.gaps_lost:
+            count = sum(map(len, new_gaps.values()))
+            lost = f"; {count} gaps were listed from the flags, their causes are lost"
+            if self.recording.dropped:
+                lost += ", and so are the gaps among the lines that retention had dropped"
+            self.tables_lost["gaps"] += lost
 
     def _flag(self, found: ArmScan) -> list[tuple[int, int, str]]:
         """Flag the lost rows of one arm; return the gaps to be listed: first line, count, cause."""
         size, reader = self.tag_rows, found.stream.reader("flags")
-        listed = sorted(self.recording.lost_rows(found.stream.arm, self.rows), key=lambda rows: rows.start)
+        listed: list[range] = []
+        if not self.gaps_lost:
+            lost_rows = self.recording.lost_rows(found.stream.arm, self.rows)
+            listed = sorted(lost_rows, key=lambda rows: rows.start)
         gaps: dict[str, list[tuple[int, int, str]]] = {"damaged": [], "unlisted": []}
         for chunk in chunks_of(size, [*self.kept, range(self.recording.lines, self.rows)]):
             here = range(chunk * size, min(self.rows, (chunk + 1) * size))
@@ -268,25 +301,29 @@ class _Recoverer:
         recording = self.recording
         gaps, events = gap_table(self.path), event_table(self.path)
         end = recording.first_line + self.rows
-        known = [(gap.arm, gap.first_line, gap.count, gap.cause) for gap in recording.gaps]
+        known = [(gap.arm, gap.first_line, gap.count, gap.cause) for gap in self.gaps]
         found = [(arm, *gap) for arm, gaps_found in new_gaps.items() for gap in gaps_found]
         for arm, first, count, cause in [*known, *found]:
             # A gap is listed as a whole: the lines at its end may never have reached the disk.
             kept = min(count, end - first)
             if kept > 0:
                 gaps.add({"first_line": first, "count": kept, "cause": cause, "arm": ARMS.index(arm)})
-        gaps.not_listed += recording.gaps_not_listed
+        if not self.gaps_lost:
+            gaps.not_listed += recording.gaps_not_listed
+        elif recording.dropped:
+            gaps.not_listed += 1  # those among dropped lines, however many: the list is not complete
         events.not_listed += recording.events_not_listed
-        for event in recording.events:
+        for event in self.events:
             events.add({"tick": event.tick, "line": event.line, "kind": event.kind, "text": event.text})
         # A writer that dies between a line's commit and that of its event leaves a line without its mark.
-        listed = {(event.line, event.kind, event.text) for event in recording.events}
+        listed = {(event.line, event.kind, event.text) for event in self.events}
         for line, kind, note in self.notes:
             if recording.first_line <= line < end and (line, kind, note) not in listed:
                 events.add({"tick": self._tick(line), "line": line, "kind": kind, "text": note})
                 listed.add((line, kind, note))
-        text = f"{self.rows} lines, {recording.lines} of them were committed"
-        events.add({"tick": 0, "line": end, "kind": "recovered", "text": text})
+        texts = [f"{self.rows} lines, {recording.lines} of them were committed"]
+        for text in (*texts, *self.tables_lost.values()):
+            events.add({"tick": 0, "line": end, "kind": "recovered", "text": text})
         for table in (gaps, events):
             table.publish(publisher, durable=True)
         return gaps.nodes() | events.nodes()
@@ -301,15 +338,22 @@ class _Recoverer:
 
     def _attributes(self, new_gaps: dict[str, list[tuple[int, int, str]]]) -> dict[str, Any]:
         attributes = dict(self.recording.attrs)
+        if self.tables_lost:
+            attributes["tables_lost"] = {**self.recording.tables_lost, **self.tables_lost}
         lost = {arm: sum(count for _, count, _ in found) for arm, found in new_gaps.items()}
         if self.sealed:
             attributes["ledger"] = ledger = copy.deepcopy(attributes["ledger"])
-            for arm, count in lost.items():
-                book = ledger.get(arm)
-                if count and isinstance(book, dict) and book.get("stored") is not None:
-                    book["stored"] -= count
+            for arm, book in ledger.items():
+                if lost.get(arm) and isinstance(book, dict) and book.get("stored") is not None:
                     missing = book.setdefault("missing", {})
-                    missing["damaged"] = missing.get("damaged", 0) + count
+                    if self.gaps_lost:
+                        # The gaps listed anew include the lines that were missing before. Without those that
+                        # retention dropped, the difference says nothing.
+                        before = sum(missing.values())
+                        lost[arm] = 0 if self.recording.dropped else max(0, lost[arm] - before)
+                    book["stored"] -= lost[arm]
+                    if lost[arm]:
+                        missing["damaged"] = missing.get("damaged", 0) + lost[arm]
             if any(lost.values()) and attributes["run_condition"] in (
                 RunCondition.GOOD,
                 RunCondition.TAINTED,
@@ -330,7 +374,7 @@ class _Recoverer:
         """Return an arm's ledger, lines = stored + missing by cause, from the listed gaps."""
         missing: dict[str, int] = {}
         end = self.recording.first_line + self.rows
-        listed = [(g.first_line, g.count, g.cause) for g in self.recording.gaps if g.arm == arm]
+        listed = [(g.first_line, g.count, g.cause) for g in self.gaps if g.arm == arm]
         for first, count, cause in [*listed, *new_gaps]:
             kept = min(count, end - first)
             if kept > 0:

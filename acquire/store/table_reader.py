@@ -23,6 +23,10 @@ MOST_ROWS = 2**20
 """Limit on what a root may claim: far above the capacity of a table."""
 
 
+TEXT_LOST = "(its text is lost)"
+"""Text of an event that was recovered from a table without its column of texts."""
+
+
 @dataclass(frozen=True, slots=True)
 class Gap:
     """Lines of one arm that were lost."""
@@ -55,6 +59,26 @@ def read_events(source: Source, nodes: dict[str, Document]) -> tuple[Event, ...]
     table = _Table(source, "events", nodes)
     texts = table.cells("text", text=True)
     return tuple(map(Event, table.words("kind"), table.numbers("tick"), table.numbers("line"), texts))
+
+
+def salvage_events(source: Source, nodes: dict[str, Document]) -> tuple[tuple[Event, ...], list[str]]:
+    """Return the events of a damaged table as far as its columns can be read, and what is wrong with others.
+
+    An event needs its line. Its kind is ``other`` if that is lost, its tick 0, its text `TEXT_LOST`.
+    """
+    table, found, wrong = _Table(source, "events", nodes), {}, []
+    for column in ("line", "kind", "tick", "text"):
+        try:
+            words = table.words(column) if column == "kind" else table.cells(column, text=column == "text")
+            found[column] = words
+        except DataError as error:
+            wrong.append(error.message.removeprefix(f"{source}: "))
+    lines = found.get("line", [])
+    instead = {"kind": "other", "tick": 0, "text": TEXT_LOST}
+    columns = [found.get(name, [value] * len(lines)) for name, value in instead.items()]
+    # Columns of different lengths are damaged as well: only the rows that all of them have are events.
+    rows = zip(*columns, lines, strict=False)
+    return tuple(Event(kind, tick, line, text) for kind, tick, text, line in rows), wrong
 
 
 @dataclass(frozen=True, slots=True)

@@ -38,7 +38,8 @@ class Verification:
     ----------
     path, state, lines : path, state and lines of the recording
     bytes : its size
-    damage : lines that are not intact on disk
+    damage : lines that are not intact on disk, and not known to be lost
+    recovered : lines that are not intact on disk, all of which are flagged as missing
     contradictions : redundant facts that disagree, in words
     notes : remarks that do not report damage
     """
@@ -48,11 +49,13 @@ class Verification:
     lines: int
     bytes: int
     damage: tuple[Damage, ...]
+    recovered: tuple[Damage, ...]
     contradictions: tuple[str, ...]
     notes: tuple[str, ...]
 
     @property
     def intact(self) -> bool:
+        """Whether everything that it claims to hold is there; it may state that lines are lost."""
         return not (self.damage or self.contradictions)
 
     def to_dict(self) -> dict[str, Any]:
@@ -63,6 +66,7 @@ class Verification:
             "lines": self.lines,
             "bytes": self.bytes,
             "damage": [damage.to_dict() for damage in self.damage],
+            "recovered": [damage.to_dict() for damage in self.recovered],
             "contradictions": list(self.contradictions),
             "notes": list(self.notes),
         }
@@ -83,21 +87,39 @@ def verify(place: Path | str, progress: Callable[[int, int], None] | None = None
         recording = open_source(source)
         scans = scan(recording, recording.kept_rows(), progress)
         gone = open_source(source).dropped  # lines that retention deleted during the scan are not damaged
-        damage = tuple(
-            found
+        found = [
+            one
             for arm in scans.values()
-            for found in arm.damages(recording.lines)
-            if not any(first <= found.first_line < first + count for first, count in gone)
-        )
+            for one in arm.damages(recording.lines)
+            if not any(first <= one.first_line < first + count for first, count in gone)
+        ]
+        # What a recovery has flagged is known to be lost: the recording claims nothing that is not there.
+        damage = tuple(one for one in found if not _is_flagged(recording, one))
         return Verification(
             path=str(source),
             state=recording.state,
             lines=recording.lines,
             bytes=source.total_bytes(),
             damage=damage,
+            recovered=tuple(one for one in found if one not in damage),
             contradictions=tuple(_contradictions(recording, scans)),
             notes=tuple(_notes(recording)),
         )
+
+
+def _is_flagged(recording: Recording, damage: Damage) -> bool:
+    """Return whether all lines of a damage are flagged as missing."""
+    start = damage.first_line - recording.first_line
+    stop, stream = start + damage.count, recording.arms[damage.arm]
+    size = stream.reader("flags").shape.chunk_rows
+    try:
+        # Chunk by chunk, as in `_read_tags`.
+        return all(
+            missing_rows(stream.read("flags", row, min(row + size, stop))).all()
+            for row in range(start, stop, size)
+        )
+    except DataError:  # the flags are damaged themselves
+        return False
 
 
 def _contradictions(recording: Recording, scans: dict[str, ArmScan]) -> Iterator[str]:
@@ -191,6 +213,8 @@ def _metadata(recording: Recording) -> Iterator[str]:
 def _notes(recording: Recording) -> Iterator[str]:
     with contextlib.suppress(DataError):  # unreadable events are reported by `_contradictions`
         yield from map(str, suspect_lines(recording))
+    for lost in recording.tables_lost.values():
+        yield f"lost of a table when it was recovered: {lost}"
     for first, count in recording.dropped:
         yield f"lines {first} to {first + count - 1} were dropped by retention"
     if recording.state != "sealed":

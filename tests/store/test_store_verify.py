@@ -13,7 +13,9 @@ import numpy as np
 import pytest
 import zarr
 from store_helpers import Truth, check_rows, fill, make_spec
+from typer.testing import CliRunner
 
+from acquire.cli import app
 from acquire.errors import DataError, PlaceError, StateError, StoreError
 from acquire.lines import ARMS, LineFlag
 from acquire.store import Circumstances, Gap, RecordingWriter, RunCondition, open_recording, recover, verify
@@ -103,6 +105,24 @@ def test_an_arm_that_is_gone_is_flagged_as_missing(path, arm):
     assert not recover(path).changed
     flags = zarr.open_group(path, mode="r")[f"{arm}/flags"][:]
     assert (flags & LineFlag.MISSING).all()
+    # It said DAMAGED for ever, although the recording states its loss.
+    found = verify(path)
+    assert (found.intact, found.damage, found.contradictions) == (True, (), ())
+    assert {damage.array for damage in found.recovered} == set(ARRAYS) - {"flags"}
+    result = CliRunner().invoke(app, ["verify", str(path)])
+    assert (result.exit_code, "recovered; sealed, 150 lines" in result.output) == (0, True)
+    assert f"lost, flagged as missing: {arm}/lines: lines 1000 to 1149" in " ".join(result.output.split())
+
+
+def test_lines_that_are_lost_after_a_recovery_are_damage_again(path):
+    flip(write(path), "b", "lines", 5)
+    recover(path)
+    flip(path, "b", "lines", 2)
+    found = verify(path)
+    assert [damage.first_line for damage in found.damage] == [1032]
+    assert [damage.first_line for damage in found.recovered] == [1080]
+    assert not found.intact
+    assert json.loads(json.dumps(found.to_dict()))["recovered"][0]["first_line"] == 1080
 
 
 @pytest.mark.parametrize("array", ARRAYS)
