@@ -11,6 +11,7 @@ from acquire.errors import DataError
 from acquire.geometry import Geometry
 from acquire.lines import ARMS
 from acquire.store import Retention, choose_codec, measure_disk
+from acquire.store.refusals import CURES
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -65,9 +66,10 @@ def choose_for(
     try:
         return choose_codec(sample, needed, measure_disk(directory))
     except OSError as error:
+        cure = CURES.get(error.errno or 0, "the kernel's log for errors of the disk")
         raise DataError(
             f"the disk of {directory} cannot be measured: {error.strerror}",
-            hint="[recording] directory on another disk, or its permissions",
+            hint=f"{cure}; or another [recording] directory",
         ) from error
 
 

@@ -52,7 +52,12 @@ def check_new_path(path: Path) -> None:
         why, hint = no
         raise UsageError(f"{path}: {why}", hint=hint)
     if not os.access(path.parent, os.W_OK | os.X_OK):
-        raise UsageError(f"{path}: the directory {path.parent} is not writable", hint="another directory")
+        why, hint = "not writable for this user", "its permissions, or another directory"
+        with suppress(OSError):
+            if os.statvfs(path.parent).f_flag & os.ST_RDONLY:
+                why = "on a disk that is mounted read-only"
+                hint = "a directory on another disk, or mount this one for writing"
+        raise UsageError(f"{path}: the directory {path.parent} is {why}", hint=hint)
     inside = path.parent.resolve()
     for directory in (inside, *inside.parents):
         try:

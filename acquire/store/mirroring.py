@@ -50,7 +50,7 @@ MARK = "a/lines/.copy-of"
 _OURS = (*ARMS, "gaps", "events", overview.NAME, ROOT, SCRATCH)
 """First parts of a recording's keys."""
 _ELSEWHERE = "another name there: acquire upload RECORDING URL"
-_HINT = "repeat the command, which continues with what is there already"
+_HINT = "then repeat the command, which continues with what is there already"
 
 
 @dataclass(frozen=True, slots=True)

@@ -20,6 +20,7 @@ from acquire.lines import ARMS
 from acquire.reading import read_object
 from acquire.store import layout, overview
 from acquire.store.files import SCRATCH, Publisher
+from acquire.store.refusals import CURES
 from acquire.store.removal import COPY, ROOT
 from acquire.store.table import event_table, gap_table
 from acquire.text import cause_in_words
@@ -94,9 +95,10 @@ def rebuild_root(path: Path, disk: Disk) -> None:
         publisher = Publisher(path / ARMS[0] / "lines" / SCRATCH, disk)
         publisher.replace(path / ROOT, layout.to_json(layout.group_document(attributes, nodes)), durable=True)
     except OSError as error:
+        cure = CURES.get(error.errno or 0, "the kernel's log for errors of the disk")
         raise DataError(
             f"{path}: its root cannot be rebuilt: {error.strerror or error}",
-            hint="free space on its disk, and the permissions of its directory; then acquire recover again",
+            hint=f"{cure}; then acquire recover again",
         ) from error
 
 

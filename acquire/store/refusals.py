@@ -51,6 +51,18 @@ _DAMAGE = (
     errno.EUCLEAN,
 )
 
+_PERMISSIONS = "its permissions for this user, or another path"
+CURES = {
+    errno.EACCES: _PERMISSIONS,
+    errno.EDQUOT: "free space within this user's quota there, a larger quota, or another disk",
+    errno.EFBIG: "a disk whose file system holds larger files",
+    errno.ENAMETOOLONG: "a shorter name",
+    errno.ENOSPC: "free space there, or another disk",
+    errno.EPERM: _PERMISSIONS,
+    errno.EROFS: "another disk, or mount this one for writing (the kernel's log says if errors ended that)",
+}
+"""What helps against an error of a disk that tells it."""
+
 _RIGHTS = "the credentials in the environment (for S3: AWS_ACCESS_KEY_ID, AWS_SECRET_ACCESS_KEY, AWS_REGION)"
 _LOCAL = ("file://", "local://")
 _NETWORK = "the network and the store's address (for S3: AWS_ENDPOINT, and AWS_ALLOW_HTTP=true for http://)"
@@ -77,7 +89,7 @@ def refused(place: object, doing: str, hint: str = "") -> Iterator[None]:
 def refusal(place: object, error: OSError, doing: str, hint: str = "") -> AcquireError:
     """Return the error for a place (path or URL) that cannot be read, written, copied: ``doing``.
 
-    ``hint`` is added to the advice.
+    ``hint`` is added to the advice, which fits the error.
     """
     text = f"{place} cannot be {doing}: {error.strerror or error}"
     if is_url(str(place)) and not str(place).startswith(_LOCAL):
@@ -90,8 +102,7 @@ def refusal(place: object, error: OSError, doing: str, hint: str = "") -> Acquir
         return kind(text, hint="; ".join(filter(None, (advice, hint))))
     if error.errno == errno.EIO and doing == "read":
         return DataError(text, hint="a copy of the recording, and the kernel's log for errors of the disk")
-    if error.errno in NOT_A_PLACE:
-        return PlaceError(text, hint=hint or "another path, or the permissions of this one")
-    if error.errno in {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}:
-        return StoreError(text, hint="free space there, or another disk")
-    return StoreError(text, hint=hint or "the kernel's log for errors of the disk")
+    place_kind = error.errno in NOT_A_PLACE
+    usual = "another path" if place_kind else "the kernel's log for errors of the disk"
+    advice = CURES.get(error.errno or 0, usual)
+    return (PlaceError if place_kind else StoreError)(text, hint="; ".join(filter(None, (advice, hint))))

@@ -12,7 +12,6 @@ of them directly, are rewritten only once a second: at ten commits a second they
 
 from __future__ import annotations
 
-import errno
 import json
 import os
 import time
@@ -30,7 +29,7 @@ from acquire.store.files import DISK, SCRATCH, Publisher, check_new_path, lock
 from acquire.store.overview import Passing, withdraw_overview, write_overview
 from acquire.store.pages import keep_freed_memory
 from acquire.store.rebuild import write_copy
-from acquire.store.refusals import refusal
+from acquire.store.refusals import CURES, refusal
 from acquire.store.removal import RESERVE, Unborn, remove
 from acquire.store.resume import list_segment
 from acquire.store.retention import Keeper, release
@@ -451,8 +450,7 @@ class RecordingWriter:
             what = f"{doing}: {error.strerror or error}"
             self._failure = self._failure or what  # the first: others follow from it
             hint = "check that the directory still exists and the kernel's log for errors of the disk"
-            if error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
-                hint = "free space there, or record to another disk"
+            hint = CURES.get(error.errno or 0, hint)
             raise kind(
                 f"{self.path}: the disk failed while {what}", possible=self._safe(), hint=hint
             ) from error
