@@ -8,15 +8,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from acquire import __version__
-from acquire.errors import DataError, UsageError
+from acquire.errors import UsageError
 from acquire.exchange.content import Array, Axis, Block, Content, block, little
 from acquire.showing import error_in_words
-from acquire.store.layout import DAMAGE
 from acquire.store.video_layout import ERROR_ATTRIBUTES
 from acquire.text import visible
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Callable, Iterator
 
     import zarr
     from numpy.typing import NDArray
@@ -58,7 +57,7 @@ def video_content(
         dims=("time", "y", "x"),
         shape=(len(kept), *video.video.shape[1:]),
         dtype=little(video.video.dtype),
-        blocks=partial(_frames, video.video, kept, "frames"),
+        blocks=partial(_frames, video.video, kept, video.frames),
         attributes={"long_name": "reconstructed light"},
     )
     inside = kept if trusted is None else _common(kept, trusted)
@@ -141,7 +140,7 @@ def _errors(video: VideoFile, kept: range) -> tuple[Array, ...]:
             dims=("time", "region_y", "region_x"),
             shape=(len(kept), *video.error.shape[1:]),
             dtype=little(video.error.dtype),
-            blocks=partial(_frames, video.error, kept, "errors of frames"),
+            blocks=partial(_frames, video.error, kept, video.errors),
             attributes=dict(ERROR_ATTRIBUTES),
         ),
     )
@@ -160,17 +159,14 @@ def _column(name: str, values: NDArray[Any], long_name: str) -> Array:
     )
 
 
-def _frames(array: zarr.Array[Any], kept: range, what: str) -> Iterator[Block]:
-    """Yield frames by whole chunks, so that none is decompressed twice."""
+def _frames(
+    array: zarr.Array[Any], kept: range, read: Callable[[int, int], NDArray[Any] | None]
+) -> Iterator[Block]:
+    """Yield what ``read`` returns of ``array``, by whole chunks, so that none is decompressed twice."""
     size, start = int(array.chunks[0]), kept.start
     while start < kept.stop:
         stop = min(kept.stop, (start // size + 1) * size)
-        try:
-            values = np.asarray(array[start:stop])
-        except DAMAGE as error:
-            raise DataError(
-                f"{what} {start} to {stop - 1} of the video cannot be read: {error}",
-                hint="a copy of the video, or acquire reconstruct once more",
-            ) from error
+        values = read(start, stop)
+        assert values is not None
         yield block((slice(start - kept.start, stop - kept.start),), values)
         start = stop

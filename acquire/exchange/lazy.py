@@ -92,6 +92,7 @@ def frames(video: VideoFile, kept: range) -> Stack:
     _, rows, columns = video.video.shape
 
     def picture(number: int) -> NDArray[Any]:
-        return np.asarray(video.video[kept[number]])
+        found: NDArray[Any] = video.frames(kept[number], kept[number] + 1)[0]
+        return found
 
     return Stack((len(kept), rows, columns), video.video.dtype, picture)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from contextlib import ExitStack
+from itertools import product
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -25,7 +26,8 @@ NOT_THERE = float("nan")
 class MosaicWriter(VideoWriter):
     """A video of ``tiles`` (rows, columns of them) of ``side`` × ``side`` voxels and as many frames as times.
 
-    Chunks are of one tile. Voxels that are never put are `NOT_THERE`. One thread at a time.
+    Chunks are of one tile. Voxels that are never put are `NOT_THERE`, which `finish` writes. One thread at a
+    time.
     """
 
     def __init__(
@@ -101,6 +103,7 @@ class MosaicWriter(VideoWriter):
             for array, values in zip(self._columns.values(), columns, strict=True):
                 array.resize((self.frames, *array.shape[1:]))
                 array[:] = values
+            self._complete()
             # In whole chunks of time, each of which is read and written once.
             step = self._levels[0].chunks[0]
             for larger, smaller in zip(self._levels, self._levels[1:], strict=False):
@@ -109,3 +112,15 @@ class MosaicWriter(VideoWriter):
                     frames = np.asarray(larger[first : first + step])
                     smaller[first : first + step] = layout.halved(frames)
         self._end(provenance)
+
+    def _complete(self) -> None:
+        """Write the chunks of which no voxel was put, so that one that is lost later differs from them."""
+        image: Any = self._levels[0]
+        step = image.chunks[0]
+        for first, row, column in product(
+            range(0, self.frames, step), *(range(0, size, self._side) for size in image.shape[1:])
+        ):
+            key = f"{first // step}/{row // self._side}/{column // self._side}"
+            if not (self._delivery.partial / "0" / "c" / key).exists():
+                place = slice(row, row + self._side), slice(column, column + self._side)
+                image[first : first + step, *place] = NOT_THERE

@@ -32,7 +32,7 @@ from acquire.store.layout import DAMAGE
 from acquire.store.opening import read_root
 from acquire.store.refusals import refused
 from acquire.store.source import source_of
-from acquire.store.video_layout import FORMAT, VideoGrid
+from acquire.store.video_layout import EVERY_CHUNK, FORMAT, VideoGrid
 from acquire.store.video_writer import VideoWriter, check_provenance
 from acquire.text import cause_in_words, shortened
 
@@ -119,11 +119,22 @@ class VideoFile:
 
     def frames(self, first: int, stop: int, step: int = 1) -> NDArray[Any]:
         """Read frames (t, y, x), as they are stored. Raises DataError if they are damaged."""
-        return _read(self.video, "frames", slice(first, stop, step))
+        return _read_frames(self.video, "frames", slice(first, stop, step), whole=self.every_chunk)
 
     def errors(self, first: int, stop: int, step: int = 1) -> NDArray[Any] | None:
         """Read ``error`` (t, region_y, region_x), if it was written. Raises DataError if it is damaged."""
-        return None if self.error is None else _read(self.error, "errors of frames", slice(first, stop, step))
+        return (
+            None
+            if self.error is None
+            else _read_frames(
+                self.error, "errors of frames", slice(first, stop, step), whole=self.every_chunk
+            )
+        )
+
+    @property
+    def every_chunk(self) -> bool:
+        """Whether each of its chunks was written, also of darkness: one that is not there is lost."""
+        return self.attrs.get(EVERY_CHUNK) is True
 
     def _transformed(self, kind: str, default: float) -> tuple[float, float, float]:
         steps = self.attrs["ome"]["multiscales"][0]["datasets"][0]["coordinateTransformations"]
@@ -132,15 +143,46 @@ class VideoFile:
         return t, y, x
 
 
-def _read(array: zarr.Array[Any], what: str, some: slice) -> NDArray[Any]:
+def _read_frames(array: zarr.Array[Any], what: str, some: slice, *, whole: bool) -> NDArray[Any]:
+    """Read some frames. Raises DataError if they are damaged, or, of a ``whole`` video, are not there."""
     try:
-        return np.asarray(array[some])
+        return _read(array, some, whole=whole)
     except DAMAGE as error:
         raise DataError(
             f"{what} {some.start} to {some.stop - 1} of {array.store_path} cannot be read: "
             f"{shortened(error, 200)}",
             hint="a copy of the video, or acquire reconstruct once more",
         ) from error
+
+
+def _read(array: zarr.Array[Any], some: slice, *, whole: bool) -> NDArray[Any]:
+    values = np.asarray(array[some])
+    if whole:
+        _check_there(array, values, some)
+    return values
+
+
+def _check_there(array: zarr.Array[Any], values: NDArray[Any], some: slice) -> None:
+    """Raise FileNotFoundError if a chunk that was read is not there: zarr returns its fill value instead."""
+    from zarr.core.sync import sync
+
+    filled = np.isnan(values) if np.isnan(array.fill_value) else values == array.fill_value
+    if not filled.any():
+        return
+    # Only chunks that look empty are looked for: each costs a remote store a request.
+    numbers = np.arange(some.start, min(some.stop, array.shape[0]), some.step or 1) // array.chunks[0]
+    for place in np.ndindex(*array.cdata_shape):
+        inside = filled[numbers == place[0]][
+            :,
+            *(
+                slice(at * size, (at + 1) * size)
+                for at, size in zip(place[1:], array.chunks[1:], strict=True)
+            ),
+        ]
+        if inside.size and inside.all():
+            key = array.metadata.encode_chunk_key(place)
+            if not sync((array.store_path / key).exists()):
+                raise FileNotFoundError(f"its file {key} is missing")
 
 
 def write_video(
@@ -222,8 +264,12 @@ def open_video(place: Path | str) -> VideoFile:
                 possible=f"{FORMAT!r}",
                 hint="acquire reconstruct, which makes videos of recordings",
             )
-        time_ns = np.asarray(child_array(group, "time")[:], np.int64)
-        quality = np.asarray(child_array(group, "quality")[:]) if "quality" in group else None
+        whole = attributes.get(EVERY_CHUNK) is True
+        all_of = slice(0, child_array(group, "time").shape[0])
+        time_ns = np.asarray(_read(child_array(group, "time"), all_of, whole=whole), np.int64)
+        quality = None
+        if "quality" in group:
+            quality = _read(child_array(group, "quality"), all_of, whole=whole)
         error = child_array(group, "error") if "error" in group else None
         found = VideoFile(child_array(group, "0"), time_ns, attributes, quality, error)
         _check(found)

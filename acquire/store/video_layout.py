@@ -18,6 +18,8 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 FORMAT = "acquire-video/1"
+EVERY_CHUNK = "every_chunk_is_written"
+"""Attribute of videos of which a chunk that is not there is lost; of earlier ones it may be all 0."""
 LARGE = 1024
 """A level with more rows or columns than this gets another level of half the size."""
 LOW, HIGH = 0.001, 0.999

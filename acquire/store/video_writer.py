@@ -25,6 +25,8 @@ if TYPE_CHECKING:
 
 CHUNK_BYTES = 4 * 2**20
 
+EVERY_CHUNK: Any = {"write_empty_chunks": True}
+"""Also chunks that hold nothing but the fill value are written: one that is not there is lost."""
 COLUMN_CHUNK = 65536
 """Number of values in a column's chunk."""
 
@@ -45,16 +47,19 @@ class VideoWriter:
         quality: bool = False,
         regions: tuple[int, int] | None = None,
         tile_side: int | None = None,
-        fill_value: float = 0,
+        fill_value: float | None = None,
     ) -> None:
         """Create the video.
 
         ``regions``: number of regions with an estimated error along rows and columns; requires ``quality``.
         ``tile_side``: rows and columns of a chunk; None: those of a frame. ``fill_value``: value of voxels
-        that are not written.
+        that are not there; None: NaN, or 0 where the type has none.
         """
         import zarr
 
+        if fill_value is None:
+            # A chunk that is lost later reads as NaN in every program, and not as darkness.
+            fill_value = float("nan") if dtype.kind == "f" else 0
         self._place, self._delivery, self._grid = place, delivery_to(place), grid
         self._name = PurePosixPath(str(place)).stem
         self._window, self._begin_ns = layout.Window(), 0
@@ -74,6 +79,7 @@ class VideoWriter:
                     fill_value=fill_value,
                     compressors=_packed(),
                     dimension_names=("t", "y", "x"),
+                    config=EVERY_CHUNK,
                 )
                 for number, each in enumerate(layout.level_shapes(shape))
             ]
@@ -141,7 +147,12 @@ class VideoWriter:
             self._levels[0].update_attributes({"coordinates": layout.coordinates_of(tuple(self._columns))})
             count, shown = len(self._levels), min(int(first), self.frames - 1)
             ome = layout.ome_attributes(self._name, self._grid, count, self._window, shown)
-            attributes = {"format": layout.FORMAT, "ome": ome, "provenance": dict(provenance)}
+            attributes = {
+                "format": layout.FORMAT,
+                layout.EVERY_CHUNK: True,
+                "ome": ome,
+                "provenance": dict(provenance),
+            }
             partial = self._delivery.partial
             nodes = {str(n): json.loads((partial / str(n) / "zarr.json").read_bytes()) for n in range(count)}
             (partial / "zarr.json").write_bytes(to_json(group_document(attributes, nodes)))
@@ -206,6 +217,7 @@ def _column(group: zarr.Group, name: str, dtype: str, attributes: dict[str, Any]
         compressors=_checked(),
         dimension_names=("t",),
         attributes=attributes,
+        config=EVERY_CHUNK,
     )
 
 
@@ -219,6 +231,7 @@ def _of_regions(group: zarr.Group, regions: tuple[int, int]) -> zarr.Array[Any]:
         compressors=_packed(),
         dimension_names=("t", "region_y", "region_x"),
         attributes=layout.ERROR_ATTRIBUTES,
+        config=EVERY_CHUNK,
     )
 
 
@@ -232,5 +245,6 @@ def _whole(group: zarr.Group, name: str, values: NDArray[Any], axis: str, grid: 
         compressors=_checked(),
         dimension_names=(axis,),
         attributes=layout.coordinate_attributes(axis, grid),
+        config=EVERY_CHUNK,
     )
     array[:] = values
