@@ -24,7 +24,7 @@ from acquire.daemon.plan import default_path, recording_of
 from acquire.daemon.report import Rates, arm_statuses, seconds_since, trigger_status
 from acquire.daemon.salvage import Salvage
 from acquire.daemon.states import Event, State, after, commands, possible
-from acquire.daemon.take import Take
+from acquire.daemon.take import Take, log_event
 from acquire.daemon.troubles import Troubles
 from acquire.daemon.uploads import Uploads
 from acquire.errors import AcquireError, StateError, UsageError
@@ -336,7 +336,7 @@ class Service:
     def _handle_event(self, note: Note) -> None:
         """Carry out the rig's action for an event."""
         assert self._run is not None
-        log.info("event: %s at line %d%s", note.kind, note.line, f": {note.text}" if note.text else "")
+        log_event(note, self._take)
         if note.kind in NEWSWORTHY:
             self.news.add(note.kind, note.text or note.kind, line=note.line)
         if not self._order.covers(note):
@@ -366,7 +366,7 @@ class Service:
         # Before the state changes: who waits for "sealed" then sees the result of a recovery, too.
         self._recovered(self._salvage.wait(RECOVERY_S))
         if aborted:
-            self._fail(f"the recording was aborted: {self._seen.end_reason}")
+            self._fail(f"the recording was aborted: {self._seen.end_reason}{take.marks_after(self._seen)}")
             return
         last = self._last
         why = f"{last.path}, {last.lines} lines, {last.condition}, {last.end_reason}" if last else ""

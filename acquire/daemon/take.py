@@ -2,16 +2,39 @@
 
 from __future__ import annotations
 
+import logging
 import time
+from collections import deque
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from acquire.daemon.messages import LastRecording, RecordingStatus
+from acquire.logs import EACH
+from acquire.text import shortened
 
 if TYPE_CHECKING:
     from acquire.stream import CaptureStatus
     from acquire.stream.messages import Note
+
+
+MOST_MARKS = 1000
+MOST_NAMED = 5
+"""Number of marks that are named in the reason of a fault."""
+
+log = logging.getLogger("acquire.daemon")
+
+
+def log_event(note: Note, take: Take | None) -> None:
+    """Write an event into the log; an operator's mark always, since the recording may end before its line."""
+    text = f": {note.text}" if note.text else ""
+    if note.kind != "mark":
+        log.info("event: %s at line %d%s", note.kind, note.line, text)
+        return
+    # Another form of entry, whose repetitions are counted on their own.
+    log.info("event: mark at line %d%s", note.line, text, extra=EACH)
+    if take is not None:
+        take.marks.append(note)
 
 
 @dataclass(slots=True)
@@ -24,12 +47,14 @@ class Take:
     lines : its budget; None: until it is stopped
     by_event : an event started it, and later events prolong it
     late : the first event that came too late to prolong it
+    marks : the latest marks since its start
     """
 
     path: Path
     lines: int | None
     by_event: bool = False
     late: Note | None = None
+    marks: deque[Note] = field(default_factory=lambda: deque(maxlen=MOST_MARKS))
     _progress: tuple[int, int] = (-1, -1)
     _moved_s: float = field(default_factory=time.monotonic)
 
@@ -51,6 +76,16 @@ class Take:
             committed_lines=seen.committed_lines,
             beyond_bytes=seen.beyond_bytes,
         )
+
+    def marks_after(self, seen: CaptureStatus) -> str:
+        """Return a clause on the marks after the last line of a recording that has ended; "" if none."""
+        end = (seen.first_line or 0) + seen.committed_lines
+        after = [f"{shortened(note.text, 60)!r}" for note in self.marks if note.line >= end]
+        if not after:
+            return ""
+        more = f" and {len(after) - MOST_NAMED} more" if len(after) > MOST_NAMED else ""
+        named = ", ".join(after[:MOST_NAMED]) + more
+        return f"; marks of lines after its last one, of which only the log is sure to have all: {named}"
 
     def result(self, seen: CaptureStatus) -> LastRecording:
         """Return the result for the daemon's status, once the recording has ended."""

@@ -5,8 +5,9 @@ from __future__ import annotations
 import os
 import re
 import signal
+import subprocess
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 import frozen_disk
@@ -18,7 +19,7 @@ from waiting import until
 from acquire.client import Client
 from acquire.daemon.messages import Status
 from acquire.daemon.states import State
-from acquire.errors import DataError
+from acquire.errors import DataError, StateError
 from acquire.store import Recording, open_recording, verify
 
 LONG_RING = "stream.ring_slots=4096"
@@ -180,3 +181,43 @@ def state_of(path: Path) -> str:
         return str(open_recording(path).state)
     except DataError:
         return ""
+
+
+def mark_until_full(client: Client, rest: Path) -> list[str]:
+    """Fill the disk with ``rest`` while the instrument takes marks; return those that it took."""
+    marks: list[str] = []
+    with rest.open("wb", buffering=0) as file:
+        while True:
+            with suppress(OSError):
+                file.write(bytes(2**16))
+            try:
+                client.mark(f"mark {len(marks)}.")
+            except StateError:
+                return marks
+            marks.append(f"mark {len(marks)}.")
+
+
+@pytest.mark.needs_mount
+def test_marks_that_a_full_disk_leaves_out_are_named_and_in_the_log(tmp_path: Path) -> None:
+    """They were accepted, and neither in the recording nor, after the tenth, in the log."""
+    place = tmp_path / "small"
+    place.mkdir()
+    subprocess.run(["mount", "-t", "tmpfs", "-o", "size=12m", "none", place], check=True)
+    try:
+        with recording(tmp_path, place / "x.zarr", "recording.reserve_gb=0.0") as (daemon, client):
+            marks = mark_until_full(client, place / "rest")
+            status = client.wait({State.FAULTED}, 30)
+            log = daemon.log.read_text()
+        found = open_recording(place / "x.zarr")
+        listed = [event.text for event in found.events if event.kind == "mark"]
+        after = [text for text in marks if text not in listed]
+        # Those within the recording are in it.
+        assert listed == marks[: len(listed)]
+        assert len(marks) > 10
+        assert all(f": {text}" in log for text in marks)
+        if after:
+            assert "marks of lines after its last one, of which only the log is sure to have all" in (
+                status.fault or ""
+            )
+    finally:
+        subprocess.run(["umount", "--lazy", place], check=True)

@@ -1,0 +1,32 @@
+"""Marks of a recording that a full disk has ended before their lines."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from acquire.daemon.take import MOST_NAMED, Take, log_event
+from acquire.stream import CaptureStatus, Note
+
+SEEN = replace(CaptureStatus(), first_line=1000, committed_lines=100)
+
+
+def test_marks_after_the_last_line_are_named() -> None:
+    take = Take(Path("r.zarr"), None)
+    for line in (1000, 1099, 1100, 1200):
+        log_event(Note(line, "mark", f"at {line}"), take)
+    log_event(Note(1200, "input", "no mark"), take)
+    assert take.marks_after(SEEN).endswith("sure to have all: 'at 1100', 'at 1200'")
+    assert take.marks_after(replace(SEEN, committed_lines=201)) == ""
+
+
+def test_of_many_marks_the_first_are_named_and_all_are_in_the_log(caplog: pytest.LogCaptureFixture) -> None:
+    take = Take(Path("r.zarr"), None)
+    with caplog.at_level("INFO"):
+        for number in range(50):
+            log_event(Note(2000 + number, "mark", f"mark {number}."), take)
+    assert take.marks_after(SEEN).endswith(f"'mark {MOST_NAMED - 1}.' and {50 - MOST_NAMED} more")
+    assert {record.__dict__["most"] for record in caplog.records} == {600}
+    assert len(caplog.records) == 50
