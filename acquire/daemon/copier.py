@@ -20,14 +20,15 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 from acquire.daemon.messages import ErrorMessage, UploadStatus
-from acquire.errors import AcquireError, PlaceError, UsageError
+from acquire.errors import AcquireError, PlaceError, StoreError, UsageError
 from acquire.processes.rank import EARLY, stand_back
 from acquire.store import open_recording
 from acquire.store.attributes import segment_of
-from acquire.store.mirroring import LOOK_S, Mirror, only_copy
+from acquire.store.files import DISK
+from acquire.store.mirroring import AGAIN, LOOK_S, Mirror, only_copy
 from acquire.store.opening import read_root
 from acquire.store.refusals import refusal
-from acquire.store.remote import RemoteSource, be_patient, check_url, url_below
+from acquire.store.remote import RemoteSource, be_patient, check_url, shares_disk, url_below
 from acquire.store.source import LocalSource
 
 if TYPE_CHECKING:
@@ -104,14 +105,17 @@ def wait_s(tries: int) -> float:
     return min(math.ldexp(FIRST_WAIT_S, min(tries, 16)), MOST_WAIT_S)
 
 
-def copy_recordings(mailbox: Mailbox, target: str, copies: tuple[Copy, ...]) -> None:
-    """Main function of the process, until its owner ends it; it begins with ``copies``."""
+def copy_recordings(mailbox: Mailbox, target: str, copies: tuple[Copy, ...], reserve_bytes: int = 0) -> None:
+    """Main function of the process, until its owner ends it; it begins with ``copies``.
+
+    ``reserve_bytes`` of the recordings' disk are left free by copies on the same one.
+    """
     stand_back(_NICE, EARLY)
     be_patient()  # before a store is opened, which reads the environment only then
     with contextlib.suppress(UsageError):  # each try reports it
         check_url(target)  # imports packages, which takes a moment
     mailbox.post(Reached(0))  # answers no query, but shows the owner that this process can
-    copier = Copier(mailbox, target)
+    copier = Copier(mailbox, target, reserve_bytes)
     for copy in copies:
         copier.add(copy.path, ours=copy.ours)
     while True:
@@ -121,8 +125,9 @@ def copy_recordings(mailbox: Mailbox, target: str, copies: tuple[Copy, ...]) -> 
 class Copier:
     """Copies the recordings of its list."""
 
-    def __init__(self, mailbox: Mailbox, target: str) -> None:
+    def __init__(self, mailbox: Mailbox, target: str, reserve_bytes: int = 0) -> None:
         self._mailbox = mailbox
+        self._reserve_bytes = reserve_bytes
         self._target = target
         self._jobs: dict[Path, Job] = {}
 
@@ -138,12 +143,13 @@ class Copier:
                 if job.mirror is not None or self._begin(job):
                     assert job.mirror is not None
                     self._advance(job, job.mirror)
+            # Nobody has to repeat a command: this process tries again by itself.
             except PlaceError as error:  # the bucket, permissions or credentials may still be created
-                self._put_off(job, error.message, error.hint)
+                self._put_off(job, error.message, error.hint.removesuffix(AGAIN).rstrip("; "))
             except UsageError as error:
                 self._end(job, state="refused", error=error.message, hint=error.hint)
             except AcquireError as error:
-                self._put_off(job, error.message, error.hint)
+                self._put_off(job, error.message, error.hint.removesuffix(AGAIN).rstrip("; "))
             except OSError as error:
                 self._put_off(job, f"{job.path}: {error.strerror or error}")
             return
@@ -199,6 +205,13 @@ class Copier:
         return True
 
     def _advance(self, job: Job, mirror: Mirror) -> None:
+        # What recordings leave free is for their ends and recoveries, and not for copies of them.
+        home = job.path.parent
+        if shares_disk(self._target, home) and DISK.free_bytes(home) <= self._reserve_bytes:
+            raise StoreError(
+                f"{job.status.url} is on the recordings' disk, of which only recording.reserve_gb is free",
+                hint="free space there, or recording.upload_to on another disk",
+            )
         done = mirror.step(most_shards=1)
         before, job.shards = job.shards, done.shards
         job.tries, job.grows = 0, mirror.grows

@@ -16,6 +16,7 @@ import numpy as np
 
 from acquire.daemon.messages import DiskStatus
 from acquire.lines import ARMS
+from acquire.store.remote import shares_disk
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -33,6 +34,8 @@ def disk_watch(config: RigConfig) -> DiskWatch:
     """Return the watch of the rig's directory."""
     line_bytes = config.pixels * np.dtype(config.cameras.a.dtype).itemsize
     per_s = len(ARMS) * line_bytes * config.passing_hz
+    if shares_disk(config.recording.upload_to, config.recording.directory.absolute()):
+        per_s *= 2  # the copies fill it as well
     return DiskWatch(config.recording.directory.absolute(), round(config.recording.reserve_gb * 1e9), per_s)
 
 
@@ -43,7 +46,7 @@ class DiskWatch:
     ----------
     directory : directory of recordings for which no path is given
     reserve_bytes : bytes of its disk that recordings leave free
-    expected_bytes_per_s : uncompressed rate of the cameras
+    expected_bytes_per_s : uncompressed rate of the cameras, and of the copies on the same disk
     """
 
     def __init__(

@@ -26,6 +26,7 @@ from acquire.lines import ARMS
 from acquire.plugins import GROUPS, OURS
 from acquire.processes.rank import sessions_share
 from acquire.processes.shared import available_bytes
+from acquire.store.remote import shares_disk
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -77,6 +78,14 @@ def examine(rig: RigConfig | None, running: str | None) -> Iterator[Finding]:
     yield _sessions(rig)
     yield _memory(rig)
     yield from _disk(Path() if rig is None else rig.recording.directory)
+    if rig is not None and shares_disk(rig.recording.upload_to, rig.recording.directory.absolute()):
+        yield Finding(
+            "uploads",
+            "warning",
+            f"{rig.recording.upload_to} is on the disk of the recordings: every line takes its room twice, "
+            "and a broken disk takes both copies",
+            "recording.upload_to on another disk or in an object store",
+        )
     yield _clock()
     yield from _network(rig)
     yield from _usb(rig)
@@ -190,6 +199,10 @@ def _disk(directory: Path) -> Iterator[Finding]:
         # Where something else is, none can be made.
         make = "" if os.path.lexists(path) else f"mkdir -p {path}, or "
         yield Finding("disk", "bad", f"{path} is not a directory", f"{make}recording.directory")
+        return
+    if os.statvfs(path).f_flag & os.ST_RDONLY:
+        text = f"{path} is on a disk that is mounted read-only"
+        yield Finding("disk", "bad", text, "mount it for writing, or recording.directory on another disk")
         return
     if not os.access(path, os.W_OK | os.X_OK):
         yield Finding("disk", "bad", f"{path} is not writable for this user", f"chown or chmod {path}")

@@ -81,7 +81,8 @@ def serve(config: RigConfig, origin: str = "", reread: Callable[[], RigConfig] |
         warm_up(*worker_modules(rig))
         salvage = Salvage(directory, journal_path(directory, config.name, "recordings"))
         salvage.search()
-        uploads = Uploads(config.recording.upload_to, journal_path(directory, config.name, "uploads"))
+        journal = journal_path(directory, config.name, "uploads")
+        uploads = Uploads(config.recording.upload_to, journal, round(config.recording.reserve_gb * 1e9))
         uploads.begin()
         proof = Proof(config)
 

@@ -68,10 +68,14 @@ class Uploads:
     ----------
     target : URL below which recordings are copied; None: they are not
     journal : file that lists recordings not copied yet
+    reserve_bytes : bytes of the recordings' disk that copies on the same one leave free
     """
 
-    def __init__(self, target: str | None = None, journal: Path | None = None) -> None:
+    def __init__(
+        self, target: str | None = None, journal: Path | None = None, reserve_bytes: int = 0
+    ) -> None:
         self._target = target
+        self._reserve_bytes = reserve_bytes
         self._journal = Journal(journal, "not_uploaded", "to be uploaded")
         self._found: dict[Path, UploadStatus] = {}
         self._noted = True
@@ -225,7 +229,7 @@ class Uploads:
             self._awake = False
             left = [path for path, one in self._found.items() if one.state not in _OVER]
             copies = tuple(Copy(path, path in self._ours) for path in left)
-            self._worker = Worker("uploads", copy_recordings, self._target, copies)
+            self._worker = Worker("uploads", copy_recordings, self._target, copies, self._reserve_bytes)
         except DeviceError as error:
             self._wait_for_another(str(error))
 

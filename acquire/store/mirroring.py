@@ -50,7 +50,7 @@ MARK = "a/lines/.copy-of"
 _OURS = (*ARMS, "gaps", "events", overview.NAME, ROOT, SCRATCH)
 """First parts of a recording's keys."""
 _ELSEWHERE = "another name there: acquire upload RECORDING URL"
-_HINT = "then repeat the command, which continues with what is there already"
+AGAIN = "then repeat the command, which continues with what is there already"
 
 
 @dataclass(frozen=True, slots=True)
@@ -199,7 +199,7 @@ class Mirror:
             self._there = self.target.sizes()
             self._check_target()
         except OSError as error:
-            raise refusal(url, error, "used", _HINT) from error
+            raise refusal(url, error, "used", AGAIN) from error
 
     @property
     def grows(self) -> bool:
@@ -235,7 +235,7 @@ class Mirror:
         except OSError as error:
             # Reading here or writing there may have failed: the error's file name tells which.
             here = error.filename is not None and str(error.filename).startswith(str(self.path))
-            what = (self.path, error, "read") if here else (self.target, error, "written", _HINT)
+            what = (self.path, error, "read") if here else (self.target, error, "written", AGAIN)
             raise refusal(*what) from error
         # Lines are held until the copy's root names them; nothing of a sealed recording is deleted any more.
         line = None if sealed else recording.first_line + lines

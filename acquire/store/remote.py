@@ -100,6 +100,19 @@ def url_below(target: str, path: Path) -> str:
     return f"{target}/{path.name}"
 
 
+def shares_disk(url: str | None, directory: Path) -> bool:
+    """Whether a copy to ``url`` goes to the disk of ``directory``, where each line then takes room twice."""
+    kind, _, place = (url or "").partition("://")
+    if kind not in ("file", "local"):
+        return False
+    try:
+        # The directory of the copies may not exist yet.
+        there = next(path for path in (Path(place), *Path(place).parents) if path.exists())
+        return there.stat().st_dev == directory.stat().st_dev
+    except (OSError, StopIteration):
+        return False
+
+
 class RemoteSource:
     """Bytes below a URL; see `source.Source`. Every failure is an OSError."""
 

@@ -19,6 +19,7 @@ from fake_run import rig_config
 import acquire
 from acquire.config import RigConfig
 from acquire.daemon import doctor
+from acquire.daemon.disk_watch import disk_watch
 from acquire.daemon.doctor import Finding, examine
 
 
@@ -79,6 +80,17 @@ def test_the_disk_is_looked_at(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
     assert "not a directory" in found(rig_config(tmp_path / "none"), "disk").text
     monkeypatch.setattr(doctor, "_file_system", lambda _: "nfs4")
     assert "waits for a network" in found(rig_config(tmp_path), "disk").text
+
+
+def test_copies_on_the_disk_of_the_recordings_are_warned_of_and_fill_it_as_well(tmp_path: Path) -> None:
+    apart = rig_config(tmp_path)
+    beside = rig_config(tmp_path, **{"recording.upload_to": f"file://{tmp_path}/copies/of"})
+    one = found(beside, "uploads")
+    assert (one.level, "every line takes its room twice" in one.text) == ("warning", True)
+    elsewhere = rig_config(tmp_path, **{"recording.upload_to": "file:///proc/copies"})
+    assert not [one for rig in (apart, elsewhere) for one in examine(rig, None) if one.name == "uploads"]
+    rates = [disk_watch(rig)._expected for rig in (apart, elsewhere, beside)]
+    assert rates == [rates[0], rates[0], 2 * rates[0]]
 
 
 def test_a_mount_with_a_space_in_its_name_is_found(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -291,3 +291,24 @@ def test_without_a_target_recordings_are_not_remembered(tmp_path: Path) -> None:
         uploads.add(tmp_path / f"{number}.zarr")
     assert not uploads._ours
     assert uploads.statuses == []
+
+
+def test_copies_on_the_recordings_disk_leave_its_reserve_free(
+    place: Place, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """They filled it, and with it what recordings had left for their ends."""
+    path, box = place.write("r.zarr"), Box()
+    free = os.statvfs(path).f_bavail * os.statvfs(path).f_frsize
+    copier = Copier(box, f"file://{place.far}", reserve_bytes=2 * free)
+    copier.add(path, ours=False)
+    copier.turn()
+    assert box.posted[-1].state == "waiting"
+    assert "of which only recording.reserve_gb is free" in box.posted[-1].error
+    assert box.posted[-1].hint == "free space there, or recording.upload_to on another disk"
+    assert not (place.far / "r.zarr" / "a").exists()
+    # Another disk has a reserve of its own.
+    monkeypatch.setattr("acquire.daemon.copier.shares_disk", lambda *_: False)
+    copier.add(path, ours=False)
+    while box.posted[-1].state != "copied":
+        copier.turn()
+    assert state_of(place.far / "r.zarr") == "sealed"
