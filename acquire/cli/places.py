@@ -44,6 +44,14 @@ def local_path(text: str) -> Path:
     return Path(text.removeprefix("file://"))
 
 
+def calibration_place(text: str) -> str:
+    """Parse the place of a calibration to write or extend. Raises what saving one there would raise."""
+    from acquire.calibrate.file import check_calibration_place
+
+    check_calibration_place(given_path(text))
+    return text
+
+
 def local_directory(text: str) -> Path:
     """Parse a directory. Raises UsageError for an empty path."""
     return Path(given_path(text))
