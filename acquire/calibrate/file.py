@@ -23,7 +23,7 @@ from zarr.errors import GroupNotFoundError
 from acquire.calibrate.calibration import FORMAT, QUANTITIES, Calibration, Measured
 from acquire.errors import DataError, PlaceError, UsageError
 from acquire.store.camera_stream import child_array
-from acquire.store.delivery import delivery_to
+from acquire.store.delivery import check_new_file, check_new_place, delivery_to
 from acquire.store.layout import DAMAGE, group_document, to_json
 from acquire.store.opening import read_root
 from acquire.store.refusals import refused
@@ -62,6 +62,17 @@ def save_calibration(place: Path | str, calibration: Calibration) -> None:
         path.rename(before)
         fresh.rename(path)
         shutil.rmtree(before)
+
+
+def check_calibration_place(place: Path | str) -> None:
+    """Raise what `save_calibration` would raise, before the recordings are made and evaluated."""
+    if is_url(place) or not os.path.lexists(place):
+        check_new_place(place)
+        return
+    open_calibration(place)
+    path = Path(place)
+    # It is replaced from beside it, so that its directory has to be writable, too.
+    check_new_file(path.with_name(f".{path.name}.{os.getpid()}.new.zarr"))
 
 
 def open_calibration(place: Path | str) -> Calibration:

@@ -12,6 +12,7 @@ from acquire.cli.calibrate_delay import delay
 from acquire.cli.calibrate_linearity import linearity
 from acquire.cli.completion import recordings
 from acquire.cli.output import JsonFlag, print_facts, print_json, print_table, print_warning, say
+from acquire.cli.places import calibration_place
 from acquire.cli.progress import stage_progress
 from acquire.cli.stretch import FirstLineOption, FromOption, LinesOption, ToOption, lines_between
 from acquire.errors import PlaceError, UsageError
@@ -34,6 +35,7 @@ OutOption = Annotated[
         "--out",
         metavar="CAL",
         help="Calibration to write, NAME.zarr. An existing one is extended with this step.",
+        parser=calibration_place,
     ),
 ]
 CoveredOption = Annotated[

@@ -11,6 +11,7 @@ from acquire.calibrate.guide import DELAY, MOST_LINES
 from acquire.cli.calibrate_live import instrument, print_finding, record, save_finding, wait_for_enter
 from acquire.cli.control import SocketOption
 from acquire.cli.output import JsonFlag, note, print_json
+from acquire.cli.places import calibration_place
 from acquire.errors import UsageError
 
 if TYPE_CHECKING:
@@ -22,7 +23,10 @@ def delay(
     out: Annotated[
         str,
         typer.Option(
-            "--out", metavar="CAL", help="Calibration to write, NAME.zarr. An existing one is extended."
+            "--out",
+            metavar="CAL",
+            help="Calibration to write, NAME.zarr. An existing one is extended.",
+            parser=calibration_place,
         ),
     ],
     recordings: Annotated[

@@ -11,6 +11,7 @@ from acquire.calibrate.guide import LINEARITY, MOST_LINES, RAMP_LINES
 from acquire.cli.calibrate_live import instrument, print_finding, record, save_finding, wait_for_enter
 from acquire.cli.control import SocketOption
 from acquire.cli.output import JsonFlag, note, print_json, say
+from acquire.cli.places import calibration_place
 
 if TYPE_CHECKING:
     from acquire.calibrate.exposure import Exposure
@@ -19,7 +20,12 @@ if TYPE_CHECKING:
 def linearity(
     out: Annotated[
         str,
-        typer.Option("--out", metavar="CAL", help="Calibration to extend, NAME.zarr. It must have a dark."),
+        typer.Option(
+            "--out",
+            metavar="CAL",
+            help="Calibration to extend, NAME.zarr. It must have a dark.",
+            parser=calibration_place,
+        ),
     ],
     recordings: Annotated[
         list[str] | None,

@@ -80,7 +80,7 @@ def export(
     from acquire.exchange import left_out, recording_content, video_content
     from acquire.exchange.export import format_for
     from acquire.store import format_of, open_recording, open_video
-    from acquire.store.files import check_new_path
+    from acquire.store.delivery import check_new_file
 
     if not 0.1 <= fps <= 240:
         raise UsageError(f"--fps {fps} is out of range", possible="0.1 to 240")
@@ -88,7 +88,7 @@ def export(
         raise UsageError(f"--peak {peak} is out of range", possible="a finite number above 0")
     # Refused before the source is opened, which may be far away.
     format_for(out)
-    check_new_path(out)
+    check_new_file(out)
     # None is not a format of ours: `open_recording` then reports what is there instead.
     if (format_of(source) or "").startswith("acquire-video/"):
         # 1, the default, averages nothing and is no mistake with a video.

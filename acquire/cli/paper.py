@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import shlex
+import shutil
 import sys
+from contextlib import contextmanager
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -11,12 +13,14 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from acquire.cli.durations import seconds
-from acquire.cli.output import JsonFlag, print_json, print_table, say
-from acquire.cli.places import new_directory
+from acquire.cli.output import JsonFlag, note, print_json, print_table, say
+from acquire.cli.places import PAGE, new_directory
 from acquire.cli.progress import activity_progress
 from acquire.errors import UsageError
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
+
     from acquire.evaluate.paper.page import Drawn
 
 # As `FIGURES` of acquire.evaluate.paper, whose import loads numpy: help does without it.
@@ -106,16 +110,22 @@ def paper(
         for name in chosen:
             # The name is bound here and now: the loop goes on to the next.
             studio = Studio(out, options, seed, lambda text, name=name: report(f"{name}: {text}"))  # type: ignore[misc]
-            if recording is None:
-                figure = make(name, studio)
-            else:
-                with mpl.rc_context(STYLE):
-                    figure = figure_of(open_recording(recording), studio, first_line)
-            # Drawn at once, so that only one figure's videos are in memory.
-            made.append(draw(figure, out, studio.host.busyness()))
+            with _whole_figure(out):
+                if recording is None:
+                    figure = make(name, studio)
+                else:
+                    with mpl.rc_context(STYLE):
+                        figure = figure_of(open_recording(recording), studio, first_line)
+                # Drawn at once, so that only one figure's videos are in memory.
+                made.append(draw(figure, out, studio.host.busyness()))
             # After every figure, so that an interrupted run leaves a page with those it has made.
             page = write_page(
-                made, studio, f"acquire {shlex.join(sys.argv[1:])}", datetime.now(UTC), recording
+                made,
+                studio,
+                f"acquire {shlex.join(sys.argv[1:])}",
+                datetime.now(UTC),
+                recording,
+                missing=chosen[len(made) :],
             )
     if json:
         print_json({"page": str(page), "figures": [each.facts for each in made]})
@@ -127,3 +137,20 @@ def paper(
         print_table(("", "paper", "here", "verdict", "detail"), rows)
         say()
     say(f"page  {page}")
+
+
+@contextmanager
+def _whole_figure(out: Path) -> Iterator[None]:
+    """Remove the files of a figure from ``out`` if it is not finished: the page says that it is missing."""
+    before = set(out.iterdir())
+    try:
+        yield
+    except BaseException:
+        for path in set(out.iterdir()) - before:
+            if path.is_dir():
+                shutil.rmtree(path, ignore_errors=True)
+            else:
+                path.unlink(missing_ok=True)
+        if (page := out / PAGE).exists():
+            note(f"{page} has the figures made so far, and names those that are missing")
+        raise

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import shutil
 import tempfile
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -15,6 +16,7 @@ if TYPE_CHECKING:
 
 SOCKET = "c.sock"
 """Name of the control socket in a `private_directory`."""
+PAGE = "index.html"
 # The address of a Unix socket has room for 104 bytes on BSD and macOS, and 108 on Linux.
 LONGEST_SOCKET = 90
 """Longest path of a socket (bytes) that every system accepts."""
@@ -44,6 +46,14 @@ def local_path(text: str) -> Path:
     return Path(text.removeprefix("file://"))
 
 
+def calibration_place(text: str) -> str:
+    """Parse the place of a calibration to write or extend. Raises what saving one there would raise."""
+    from acquire.calibrate.file import check_calibration_place
+
+    check_calibration_place(given_path(text))
+    return text
+
+
 def local_directory(text: str) -> Path:
     """Parse a directory. Raises UsageError for an empty path."""
     return Path(given_path(text))
@@ -62,13 +72,17 @@ def private_directory() -> Iterator[Path]:
 
 @contextlib.contextmanager
 def new_directory(path: Path) -> Iterator[None]:
-    """Create the output directory of a command; it is removed again if the command leaves it empty."""
+    """Create the output directory of a command that writes a page into it, as its last file.
+
+    If the command ends early without a page, what it has made is removed: nobody could tell what is missing.
+    """
     make_directory(path)
     try:
         yield
-    finally:
-        with contextlib.suppress(OSError):  # raised if it is not empty
-            path.rmdir()
+    except BaseException:
+        if not (path / PAGE).exists():
+            shutil.rmtree(path, ignore_errors=True)
+        raise
 
 
 def make_directory(path: Path) -> None:

@@ -56,7 +56,7 @@ def print_outcomes(outcomes: list[Outcome], *, json: bool, preview: bool, more: 
                     part["iterations"],
                     f"{part['seconds']:.1f}",
                     f"{part['quality']['misfit']:.2%}",
-                    "yes" if part["trusted"] else "no",
+                    "no" if not part["trusted"] else "in part" if part["unseen"] else "yes",
                 )
                 for number, part in enumerate(segments, 1)
             ]
@@ -90,6 +90,8 @@ def _outcome_facts(outcome: Outcome) -> dict[str, Any]:
 
     first, end = facts["trusted"]
     reason = "all frames are sampled only in part" if solved else "no sub-segment was finished"
+    if solved and any(part["unseen"] for part in facts["segments"]):
+        reason = "an arm has no usable sample of the others"
     iterations, of_iterations = facts["iterations"], facts["iterations_asked"]
     iterated = f"{iterations} of {of_iterations}" if iterations < of_iterations else str(iterations)
     noise = None

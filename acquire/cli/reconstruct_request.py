@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from acquire.cli.durations import parse_duration_ns
@@ -24,11 +25,10 @@ from acquire.reconstruct.select import (
     in_tiles,
     in_voxels,
 )
+from acquire.store.delivery import check_new_file
 from acquire.store.files import check_new_path
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
     from acquire.config.plan import ReconstructionPlan
     from acquire.fibre import Tile
     from acquire.reconstruct import Options, VideoRequest
@@ -157,7 +157,13 @@ def check_arguments(arguments: Arguments) -> None:
             raise UsageError(
                 "--save-plan: there is no plan to save", possible="with --auto, --plan or --segment"
             )
-        check_new_path(arguments.save_plan)
+        check_new_file(arguments.save_plan)
+        if arguments.out is not None and arguments.save_plan.resolve() == Path(arguments.out).resolve():
+            raise UsageError(
+                f"--save-plan and --out are both {arguments.save_plan}, but a plan is a file and a video a "
+                "directory",
+                possible="two names: --save-plan NAME.toml --out NAME.zarr",
+            )
 
 
 def suffixes(arguments: Arguments) -> list[str]:

@@ -276,12 +276,18 @@ def cut(
 
     from acquire.lines import merged
     from acquire.store import open_recording
-    from acquire.store.delivery import whole_file
-    from acquire.store.files import check_new_path
+    from acquire.store.delivery import check_new_file, whole_file
     from acquire.store.refusals import refused
 
     # Now, and not only when it is written: reading and merging may take minutes.
-    check_new_path(out)
+    if out.suffix.lower() != ".npz":
+        raise UsageError(
+            f"cut cannot write {str(out)!r}: its result is a NumPy archive, and is named so",
+            possible="NAME.npz; acquire export writes lines in other formats",
+            # pathlib has no suffix for a name that is only a dot
+            hint=f"--out {out.with_suffix('.npz')}" if out.name.strip(".") else "",
+        )
+    check_new_file(out)
     opened = open_recording(recording)
     first, count = lines_between(opened, first_line, lines, begin, end)
     # Retention may have dropped the first lines of an endless recording.

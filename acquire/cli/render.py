@@ -61,8 +61,7 @@ def render(
     from acquire.evaluate.rendering import Look, Panel, check_suffix
     from acquire.evaluate.rendering import render as draw
     from acquire.store import open_video
-    from acquire.store.delivery import whole_file
-    from acquire.store.files import check_new_path
+    from acquire.store.delivery import check_new_file, whole_file
     from acquire.store.refusals import refused
 
     sheet = out.suffix.lower() == ".png"
@@ -78,7 +77,7 @@ def render(
         if not low <= value <= high:
             raise UsageError(f"{name} {value} is out of range", possible=f"{low} to {high}")
     check_suffix(out)
-    check_new_path(out)
+    check_new_file(out)
     # A URL has slashes on every system.
     panels = [Panel(PurePosixPath(place).stem, open_video(place)) for place in video]
     with (

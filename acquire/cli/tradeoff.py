@@ -20,7 +20,7 @@ from acquire.cli.output import JsonFlag, print_json, print_table, print_warning,
 from acquire.cli.places import new_directory
 from acquire.cli.progress import activity_progress, stage_progress
 from acquire.cli.tiles import TileOption, tile_of
-from acquire.errors import UsageError
+from acquire.errors import EXIT_INTERRUPTED, UsageError
 
 if TYPE_CHECKING:
     from acquire.evaluate.cases import Case
@@ -32,6 +32,7 @@ if TYPE_CHECKING:
     from acquire.store import Recording
 
 LINES, FIRST_LINE = 263, 200
+ONE_RUN = "One run of each kind."
 APART = 67
 """Distance between two repeats, in lines."""
 LONGEST_S = 60.0
@@ -137,31 +138,41 @@ def tradeoff(
     with new_directory(out):
         cases, effects = _cases(sources, out, full_well or [], (first_line, lines, repeats), tile)
         host = HostWatch()
+        total = len(cases) * repeats * len(kinds) * len(combinations)
         runs, truths = _measure(cases, repeats, kinds, combinations=combinations, longest_s=budget, host=host)
+        interrupted = f"Interrupted after {len(runs)} of {total} runs." if len(runs) < total else None
         differences = dict.fromkeys(case.repeats for case in cases)
         heading = {
             "title": ", ".join(Path(source).stem for source in sources),
             "command": f"acquire {shlex.join(sys.argv[1:])}",
-            "notes": [f"{repeats} repeats: {each}." for each in differences]
-            if repeats > 1
-            else ["One run of each kind."],
+            "notes": [
+                *([] if interrupted is None else [interrupted]),
+                *([f"{repeats} repeats: {each}." for each in differences] if repeats > 1 else [ONE_RUN]),
+            ],
             "host": host.busyness().facts(),
         }
         page = write_page(runs, truths, effects, directory=out, heading=heading, when=datetime.now(UTC))
     kept = None
-    if learn:
+    # An interrupted study has fewer repeats, of some cases only: it must not decide for all later commands.
+    if learn and interrupted is None:
         try:
             kept = remember(_lessons(runs))
         except OSError as error:  # the page is there, and may have taken hours
             print_warning(f"the presets' results are not kept for --budget: {error}")
     if json:
-        print_json({"page": str(page), "learned": kept and str(kept), "rows": table(runs)})
+        facts = {"page": str(page), "learned": kept and str(kept), "interrupted": interrupted}
+        print_json({**facts, "rows": table(runs)})
+        if interrupted is not None:
+            raise typer.Exit(EXIT_INTERRUPTED)
         return
     _print(runs)
     say()
     say(f"page     {page}")
     if kept is not None:
         say(f"learned  {kept}")
+    if interrupted is not None:
+        print_warning(f"{interrupted[:-1]}: the page has only these, and no preset is learned from them")
+        raise typer.Exit(EXIT_INTERRUPTED)
 
 
 def _measure(
@@ -173,10 +184,34 @@ def _measure(
     longest_s: float,
     host: HostWatch,
 ) -> tuple[list[Run], dict[tuple[str, Voxels], Any]]:
-    """Measure every combination of solver, preset and dtype; return the runs and the true frames to show."""
+    """Measure every combination of solver, preset and dtype; return the runs and the true frames to show.
+
+    Ctrl-C ends it with the runs made so far, which may have taken hours, if there are any.
+    """
+    runs: list[Run] = []
+    truths: dict[tuple[str, Voxels], Any] = {}
+    try:
+        _measure_into(runs, truths, cases, repeats, kinds, combinations, longest_s, host)
+    except KeyboardInterrupt:
+        if not runs:
+            raise
+    host.look()
+    return runs, truths
+
+
+def _measure_into(
+    runs: list[Run],
+    truths: dict[tuple[str, Voxels], Any],
+    cases: list[Case],
+    repeats: int,
+    kinds: tuple[Voxels, ...],
+    combinations: list[tuple[str, str, str]],
+    longest_s: float,
+    host: HostWatch,
+) -> None:
+    """Add the runs, and the true frames of the first repeat, as they are made."""
     from acquire.evaluate.tradeoff import measure
 
-    runs, truths = [], {}
     for case, repeat in itertools.product(cases, range(repeats)):
         with activity_progress(f"preparing {case.name}"):
             judge = case.judge(repeat)
@@ -199,8 +234,6 @@ def _measure(
             if repeat == 0:
                 true = judge.truth(voxels)
                 truths[case.name, voxels] = None if true is None else true[judge.picked(voxels)].copy()
-    host.look()
-    return runs, truths
 
 
 def _cases(

@@ -16,6 +16,7 @@ import numpy as np
 from acquire import __version__
 from acquire.calibrate.choose import provenance
 from acquire.errors import AcquireError, UsageError
+from acquire.flags import NO_IMAGE, LineFlag
 from acquire.plugins import DENOISERS, SOLVERS, of_others
 from acquire.recon.diagnosis import TURNED
 from acquire.recon.error import combined_facts
@@ -24,7 +25,9 @@ from acquire.reconstruct.arms import balance_of_recording
 from acquire.reconstruct.budget import Budget
 from acquire.reconstruct.sharing import SharedChoices, liveliest_first, sharing_facts
 from acquire.reconstruct.sheet import open_sheet
-from acquire.reconstruct.work import Task
+from acquire.reconstruct.unseen import Unseen, longest, remaining, within
+from acquire.reconstruct.work import Task, as_read
+from acquire.store.present import flags_of
 from acquire.store.remote import is_url
 
 if TYPE_CHECKING:
@@ -94,11 +97,13 @@ def combine(
     watcher requests a stop, the part solved so far is written and marked as interrupted. A DataError, or
     whatever a sub-segment raises, leaves nothing behind. The options' budget is wall time from ``began``
     (`time.monotonic`; the call if None) to the end of the video. Raises UsageError if it cannot be kept, and
-    if both arms have lost all lines of a sub-segment, before anything is computed.
+    if both arms have lost all lines of a sub-segment, or no sample of them is usable, before anything is
+    computed.
     """
     called, grid = time.monotonic(), request.grid
     segments = request.sub_segments()
     _refuse_lost(recording, segments)
+    _refuse_unusable(recording, segments, options, request.tiles or (None,))
     location = str(recording) if is_url(str(recording)) else str(recording.path.resolve())
     balance, balance_facts, warnings = balance_of_recording(recording, options)
     options = replace(options, balance=balance)
@@ -130,7 +135,11 @@ def combine(
         facts = describe_parts(recording, request, done, options)
         cut = len(done) < len(tasks) and not watcher.stopped
         # Sub-segments repeat each other's warnings word for word: each is kept once, in order.
-        warnings = (*warnings, *(text for part in done for text in part["warnings"]))
+        warnings = (
+            *warnings,
+            *_words_on_unseen(request, len(segments), sheet.frames, done),
+            *(text for part in done for text in part["warnings"]),
+        )
         facts |= {"balance": balance_facts, "warnings": list(dict.fromkeys(warnings))}
         facts["choice"] = sharing_facts(done) if sharing else None
         facts["state"] = "interrupted" if cut or watcher.stopped else "complete"
@@ -159,6 +168,34 @@ def _refuse_lost(recording: Recording, segments: Sequence[SubSegment]) -> None:
             f"no video can be made of lines {first} to {first + lines - 1}: both arms have lost all of them",
             possible="lines before them, or after them; acquire info lists what is lost",
         )
+
+
+def _refuse_unusable(
+    recording: Recording, segments: Sequence[SubSegment], options: Options, tiles: Sequence[Tile | None]
+) -> None:
+    """Raise UsageError if no sample of a sub-segment is usable, such as where both arms are saturated.
+
+    A line that is flagged as saturated may have only one sample at the top of the range: the samples are
+    read, which takes longer, only of sub-segments that have no line without such a flag.
+    """
+    doubtful = NO_IMAGE | LineFlag.SATURATED
+    for each in segments:
+        row = each.first_line - recording.first_line
+        flags = (flags_of(recording, arm, row, row + each.lines) for arm in recording.arms)
+        if not all((of_arm & doubtful).all() for of_arm in flags):
+            continue
+        for tile in tiles:
+            lines = as_read(recording.cut(each.first_line, each.lines, tile), options)
+            if lines.mask.any():
+                continue
+            last = each.first_line + each.lines - 1
+            where = "" if tile is None else f" in tile {tile}"
+            raise UsageError(
+                f"no video can be made of lines {each.first_line} to {last}: none of their samples is "
+                f"usable{where}, since they are lost, saturated or masked in both arms",
+                possible="lines before them, or after them: --first-line and --lines, or --from and --to",
+                hint="acquire info lists what is lost; for saturated lines, less light or a lower gain",
+            )
 
 
 def _solved(
@@ -267,26 +304,43 @@ def _trusted_of_all_tiles(
     if request.tiles and len(parts) < count * len(request.tiles):
         return begin, begin
     # Of each tile the longest run is trusted; of all tiles, what these have in common.
-    by_tile = [
-        _longest_trusted([(each, part["trusted"]) for each, part in zip(segments, of_tile, strict=False)])
-        for of_tile in (parts[first : first + count] for first in range(0, len(parts), count))
-    ]
+    by_tile = []
+    for of_tile in (parts[first : first + count] for first in range(0, len(parts), count)):
+        runs = _trusted_runs([(each, part["trusted"]) for each, part in zip(segments, of_tile, strict=False)])
+        unseen = _unseen_of(of_tile, request.trusted)
+        by_tile.append(longest((each for run in runs for each in remaining(run, unseen)), begin))
     low, high = max(low for low, _ in by_tile), min(high for _, high in by_tile)
     return low, max(low, high)
 
 
-def _longest_trusted(segments: Sequence[tuple[SubSegment, bool]]) -> tuple[int, int]:
-    """Return the longest run of trusted sub-segments, in sub-steps, without its fades into others."""
+def _unseen_of(parts: Sequence[dict[str, Any]], trusted: tuple[int, int]) -> list[Unseen]:
+    """Return what an arm did not see of the sub-steps that are sampled in full otherwise."""
+    return within((Unseen(**each) for part in parts for each in part["unseen"]), *trusted)
+
+
+def _words_on_unseen(
+    request: VideoRequest, count: int, frames: int, parts: Sequence[dict[str, Any]]
+) -> Iterator[str]:
+    """Yield a warning for each range of frames that is not trusted since an arm did not see it."""
+    begin, T_m = request.grid.begin, request.grid.voxels.temporal_merge
+    for of_tile in (parts[first : first + count] for first in range(0, len(parts), count)):
+        prefix = "" if of_tile[0]["tile"] is None else f"tile {of_tile[0]['tile']}: "
+        for each in _unseen_of(of_tile, request.trusted):
+            last = min(frames, -(-(each.end - begin) // T_m)) - 1
+            yield prefix + each.words((each.begin - begin) // T_m, last)
+
+
+def _trusted_runs(segments: Sequence[tuple[SubSegment, bool]]) -> list[tuple[int, int]]:
+    """Return the runs of trusted sub-segments, in sub-steps, without their fades into others."""
     runs = [[each for each, _ in run] for trusted, run in groupby(segments, itemgetter(1)) if trusted]
     first, last = segments[0][0], segments[-1][0]
-    edges = [
+    return [
         (
             run[0].begin + (0 if run[0] is first else run[0].fade_in),
             run[-1].end - (0 if run[-1] is last else run[-1].fade_out),
         )
         for run in runs
     ]
-    return max(edges, key=lambda each: each[1] - each[0], default=(first.begin, first.begin))
 
 
 def _trusted_frames(request: VideoRequest, frames: int, trusted: tuple[int, int]) -> list[int]:

@@ -16,7 +16,8 @@ from acquire.recon.diagnosis import undo_turn
 from acquire.recon.error import regions_of
 from acquire.recon.hypotheses import AS_BUILT
 from acquire.recon.reuse import Choice
-from acquire.reconstruct.facts import result_facts, why_not_trusted
+from acquire.reconstruct.facts import result_facts, warnings_of, why_not_trusted
+from acquire.reconstruct.unseen import find_unseen, within
 from acquire.store import open_recording
 
 if TYPE_CHECKING:
@@ -166,6 +167,8 @@ def solve(task: Task, watch: Watch) -> Part:
     substeps = lines.geometry.substeps
     last = segment.first_line + segment.lines - 1
     doubt = why_not_trusted(result, f"the sub-segment of lines {segment.first_line} to {last}")
+    warnings = warnings_of(result, limited=options.budget_s is not None)
+    unseen = within(find_unseen(lines, voxels.temporal_merge), segment.begin, segment.end)
     prefix = "" if task.tile is None else f"tile {task.tile}: "
     return Part(
         video=task.grid.resample(result.video, segment, substeps),
@@ -180,9 +183,10 @@ def solve(task: Task, watch: Watch) -> Part:
             "spatial_merge": voxels.spatial_merge,
             "temporal_merge": voxels.temporal_merge,
             "trusted": doubt is None,
+            "unseen": [each.to_dict() for each in unseen],
             "tile": None if task.tile is None else str(task.tile),
             "kept_choice": None if task.choice is None else task.choice.kept(result.parameters),
-            "warnings": [prefix + text for text in (*([] if doubt is None else [doubt]), *result.warnings)],
+            "warnings": [prefix + text for text in (*([] if doubt is None else [doubt]), *warnings)],
         },
         # A search that was stopped has not chosen.
         choice=Choice.of(result) if result.believed and result.ended != "stopped" else None,

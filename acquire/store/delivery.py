@@ -94,11 +94,24 @@ def delivery_to(place: Path | str) -> Delivery:
 
 
 def check_new_place(place: Path | str) -> None:
-    """Do as `check_new_path`, for a path or a URL."""
+    """Do as `check_new_file`, for a path or a URL."""
     if is_url(place):
         _check_free(RemoteSource(str(place)))
     else:
-        check_new_path(Path(place))
+        check_new_file(Path(place))
+
+
+def check_new_file(path: Path) -> None:
+    """Do as `check_new_path`, and try it: create a file beside ``path``, and remove it.
+
+    For outputs that are written only after minutes of work. Permissions do not tell everything: /proc refuses
+    any new file, a disk may be full of files, and a name may be too long once `_partial` has extended it.
+    """
+    check_new_path(path)
+    with refused(path, "written"):
+        part = _partial(path)
+        part.open("xb").close()
+        part.unlink()
 
 
 class _LocalDelivery:

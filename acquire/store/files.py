@@ -43,6 +43,11 @@ def check_new_path(path: Path) -> None:
         os.lstat(path)
     except (FileNotFoundError, NotADirectoryError):
         pass
+    except PermissionError as error:
+        raise UsageError(
+            f"{path}: the directory {path.parent} may not be entered",
+            hint="another directory, or the permissions of this one",
+        ) from error
     except (OSError, ValueError) as error:  # too long, a circle of links, NUL, not encodable
         reason = error.strerror if isinstance(error, OSError) else error
         raise UsageError(f"{str(path)!r} cannot be a path: {reason}", hint="another name") from error

@@ -61,6 +61,18 @@ MEANINGS = {
 }
 """Texts for refusals and for the status."""
 
+ADVICE = {
+    Stage.NONE: "start a recording first",
+    Stage.ASKED: "wait until it has begun (acquire status shows it), or disarm",
+    Stage.CANCELLED: "start another one; acquire bench measures the disk",
+    Stage.RECORDING: "stop it first",
+    Stage.REPLACED: "stop it first",
+    Stage.PAUSED: "stop it first",
+    Stage.SEALED: "start another one",
+    Stage.LOST: "disarm, and arm again; acquire recover seals the recording",
+}
+"""What to try where a start or a stop is refused."""
+
 UNDER_WAY = frozenset({Stage.RECORDING, Stage.REPLACED, Stage.PAUSED})
 """Stages in which a recording is open, or will be continued."""
 
@@ -145,9 +157,15 @@ def after(stage: Stage, event: Event) -> Stage:
     try:
         return TABLE[stage, event]
     except KeyError:
-        others = ", ".join(other for other in (Event.BEGIN, Event.END) if (stage, other) in TABLE)
-        hint = "stop it first" if event is Event.BEGIN and stage in UNDER_WAY else ""
-        raise StateError(f"{event}: {MEANINGS[stage]}", possible=others, hint=hint) from None
+        raise refusal(stage, event) from None
+
+
+def refusal(stage: Stage, event: Event) -> StateError:
+    """Return the error for an event that has no row in the table, with what is possible instead."""
+    others = ", ".join(other for other in (Event.BEGIN, Event.END) if (stage, other) in TABLE)
+    # What the recorder reports is nobody's command: whoever reads of it can only begin anew.
+    hint = ADVICE[stage] if event in (Event.BEGIN, Event.END) else "disarm, and arm again"
+    return StateError(f"{event}: {MEANINGS[stage]}", possible=others, hint=hint)
 
 
 class Lifecycle:
@@ -249,7 +267,7 @@ class Lifecycle:
         """Note that it is closed, with ``rows`` of each arm; ``committed_lines`` of them are on the disk."""
         began, begin, path = self.began, self._begin, self.path
         if began is None or begin is None or path is None:
-            raise StateError(f"{Event.SEALED}: {MEANINGS[self.stage]}")
+            raise refusal(self.stage, Event.SEALED)
         following = None
         if self._goes_on and sealed.end_line is not None and self._end_reason is None and not self._failed:
             following = resumed(begin, began, sealed.end_line, sealed.end_reason)

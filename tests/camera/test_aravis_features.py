@@ -126,6 +126,15 @@ def test_what_only_computes_is_read_and_is_refused_with_what_it_reads(described:
         apply(described, ("remote", "PlainRegister", 3))
 
 
+def test_a_feature_that_fails_comes_with_advice(described: AravisCamera) -> None:
+    """It was Aravis' message alone."""
+    node = described.features()["remote"].find("PeriodInMs")
+    assert node is not None
+    with pytest.raises(CameraError, match=r"set PeriodInMs to 3\.0: ") as refused:
+        node.write(3.0)
+    assert "acquire camera features SERIAL lists" in refused.value.hint
+
+
 def test_a_command_is_waited_for_until_the_camera_has_carried_it_out(
     described: AravisCamera, monkeypatch: pytest.MonkeyPatch
 ) -> None:

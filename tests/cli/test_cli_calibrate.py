@@ -165,3 +165,24 @@ def test_what_is_no_calibration_is_not_called_no_recording(cli: Cli, tmp_path: P
     answer = cli("calibrate", "show", tmp_path / "cal.zarr")
     assert answer.code == 2
     assert "is not a calibration: it holds no zarr.json" in answer.err
+
+
+@pytest.mark.parametrize("step", ["dark", "linearity", "delay", "all"])
+@pytest.mark.parametrize("place", ["/proc/cal.zarr", f"{'n' * 240}.zarr", "none/cal.zarr"])
+def test_a_calibration_that_cannot_be_written_is_refused_before_any_work(
+    cli: Cli, tmp_path: Path, step: str, place: str
+) -> None:
+    """It was noticed once the recordings had been made and evaluated; here, there are none and no daemon."""
+    words = [] if step == "all" else [tmp_path / "no-recording.zarr"]
+    answer = cli("calibrate", step, *words, "--out", tmp_path / place)
+    assert answer.code == 2
+    assert any(why in answer.err for why in ("cannot be written", "does not exist\n  try: create it first"))
+    assert not list(tmp_path.iterdir())
+
+
+def test_what_is_no_calibration_is_not_replaced_and_refused_at_once(cli: Cli, tmp_path: Path) -> None:
+    other = tmp_path / "notes.zarr"
+    other.mkdir()
+    answer = cli("calibrate", "dark", tmp_path / "no-recording.zarr", "--out", other)
+    assert (answer.code, list(tmp_path.iterdir())) == (2, [other])
+    assert f"{other} is not a calibration" in answer.err

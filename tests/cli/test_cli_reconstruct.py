@@ -187,6 +187,26 @@ def test_nothing_slow_is_done_for_a_file_that_exists(cli: Cli, recording: Path, 
     assert "looking for changes" not in answer.err
 
 
+@pytest.mark.parametrize("plan", ["/proc/plan.toml", f"{'n' * 240}.toml"])
+def test_nothing_slow_is_done_for_a_plan_that_cannot_be_written(
+    cli: Cli, recording: Path, tmp_path: Path, plan: str
+) -> None:
+    """Permissions allow both; the work of minutes was lost, because only writing the plan failed."""
+    answer = cli("reconstruct", recording, "--auto", "--save-plan", tmp_path / plan)
+    assert (answer.code, "cannot be written" in answer.err) == (2, True)
+    assert "looking for changes" not in answer.err
+    assert not list(tmp_path.iterdir())
+
+
+def test_plan_and_video_need_two_names(cli: Cli, recording: Path, tmp_path: Path) -> None:
+    both = tmp_path / "both"
+    words = ("--segment", ":2x2", "--save-plan", both, "--out", f"{tmp_path}/./both")
+    answer = cli("reconstruct", recording, *words)
+    assert answer.code == 2
+    assert "a plan is a file and a video a directory" in answer.err
+    assert not both.exists()
+
+
 @pytest.mark.parametrize("name", ["v.mp4", "v.ome.tif", "v.NPZ"])
 def test_the_name_of_a_file_is_refused(cli: Cli, recording: Path, tmp_path: Path, name: str) -> None:
     """It became a directory of this name, which no program would open."""

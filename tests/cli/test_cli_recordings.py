@@ -450,3 +450,32 @@ def test_a_path_as_the_target_of_an_upload_is_refused_with_its_url(
     assert answer.code == 2
     assert "copy.zarr is not a URL; possible: file:///" in answer.err.replace("\n  ", "; ")
     assert f"try: file://{tmp_path}/copy.zarr" in answer.err
+
+
+@pytest.mark.parametrize("name", ["segment.txt", "segment", "segment.npy", "."])
+def test_a_cut_is_named_as_the_archive_that_it_is(
+    cli: Cli, recording: Path, tmp_path: Path, name: str
+) -> None:
+    """NAME.txt held a NumPy archive, which no program for texts opens."""
+    answer = cli("cut", recording, "--lines", 20, "--out", f"{tmp_path}/{name}")
+    assert answer.code == 2
+    assert "possible: NAME.npz" in answer.err
+    assert not list(tmp_path.glob("*segment*"))
+
+
+def test_a_directory_that_may_not_be_entered_is_not_called_a_wrong_name(
+    cli: Cli, recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The advice was another name, with which it fails in the same way."""
+    lstat, locked = os.lstat, tmp_path / "locked"
+
+    def refuse(path: Any, **options: Any) -> Any:
+        if Path(path).parent == locked:
+            raise PermissionError(errno.EACCES, "Permission denied")
+        return lstat(path, **options)
+
+    monkeypatch.setattr(os, "lstat", refuse)
+    answer = cli("cut", recording, "--lines", 20, "--out", locked / "cut.npz")
+    assert answer.code == 2
+    assert f"the directory {locked} may not be entered" in answer.err
+    assert "another directory, or the permissions" in answer.err

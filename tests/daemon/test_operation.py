@@ -40,6 +40,8 @@ from acquire.daemon.setup import setup_of
 from acquire.daemon.states import State
 from acquire.daemon.unit import WATCHDOG_S, unit_text
 from acquire.errors import ConfigError, UsageError
+from acquire.trigger.transports.base import UDEV_HINT
+from acquire.trigger.transports.usb import VENDOR
 
 
 def until_written(path: Path, lines: int) -> list[dict[str, str]]:
@@ -302,6 +304,27 @@ def test_systemd_takes_the_unit(tmp_path: Path) -> None:
     (tmp_path / "acquire.service").write_text("mine")
     with pytest.raises(UsageError, match="exists with different contents"):
         install_service("rig-demo", directory=tmp_path)
+
+
+def test_the_udev_rule_alone_needs_no_rig_and_can_be_saved_as_it_is_printed(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The advice named a file of the firmware's sources, which an installed package does not have."""
+    install_service(None, udev=True)
+    printed = capsys.readouterr()
+    install_service(None, udev=True, directory=tmp_path)
+    (rule,) = tmp_path.iterdir()
+    assert printed.out == f"# /etc/udev/rules.d/{rule.name}\n{rule.read_text()}"
+    assert f'ATTR{{idVendor}}=="{VENDOR:04x}"' in rule.read_text()
+    assert "udevadm control --reload" in printed.err
+    assert int(rule.name[:2]) < 73, "TAG uaccess has no effect from 73 on"
+    assert "acquire install-service --udev" in UDEV_HINT
+
+
+@pytest.mark.parametrize(("config", "udev"), [("rig-demo", True), (None, False)])
+def test_a_service_needs_a_rig_and_the_rule_alone_takes_none(config: str | None, udev: bool) -> None:
+    with pytest.raises(UsageError, match=r"--config.*possible: .*--udev"):
+        install_service(config, udev=udev)
 
 
 def test_every_alert_is_on_a_metric_that_there_is(tmp_path: Path) -> None:

@@ -133,8 +133,9 @@ def test_pair(stage: Stage, event: Event, tmp_path: Path) -> None:
     if event is Event.OVER:  # lines come at every stage
         assert bench.happen(event) is False
     else:
-        with pytest.raises(StateError, match=MEANINGS[stage]):
+        with pytest.raises(StateError, match=MEANINGS[stage]) as refused:
             bench.happen(event)
+        assert refused.value.hint, "nobody knows what to do about it"
     assert bench.life.stage is stage
     assert (bench.life.began, bench.life.sealed, bench.life.path, bench.life.orphans) == before
 
@@ -156,7 +157,11 @@ def test_the_document_has_the_words_of_the_table() -> None:
     ("stage", "text"),
     [
         (Stage.RECORDING, "start: a recording is being written; possible: stop; try: stop it first"),
-        (Stage.ASKED, "start: a recording is being created"),
+        (
+            Stage.ASKED,
+            "start: a recording is being created; try: wait until it has begun (acquire status shows it), or "
+            "disarm",
+        ),
     ],
 )
 def test_a_start_is_refused_in_the_words_of_the_table(stage: Stage, text: str, tmp_path: Path) -> None:

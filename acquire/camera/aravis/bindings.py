@@ -137,7 +137,7 @@ class _GError(ctypes.Structure):
 
 
 @contextmanager
-def errors(what: str, hint: str = "") -> Iterator[Any]:
+def errors(what: str, hint: str) -> Iterator[Any]:
     """Yield a place for a GError; raise CameraError, with the hint, if one was stored there."""
     place = POINTER(_GError)()  # NULL: GLib reports no error into a place that seems to have one
     yield byref(place)

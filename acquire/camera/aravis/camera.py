@@ -264,7 +264,7 @@ class AravisCamera:
         while self._taken:  # buffers popped from the stream are ours; it frees the others itself
             self._library.g_object_unref(self._taken.pop())
         try:
-            with errors("stop") as error:
+            with errors("stop", REACH) as error:
                 self._library.arv_camera_stop_acquisition(self._camera, error)
         except CameraError:
             return  # a camera that is gone has stopped

@@ -28,6 +28,11 @@ _KINDS: tuple[tuple[bytes, Kind], ...] = (
 ways to read one, and some match several (an enumeration is also an integer)."""
 
 _MOST = sys.float_info.max
+FEATURE = (
+    "acquire camera features SERIAL lists what the camera accepts now, which other features may decide "
+    "(a mode, a selector, whether lines are running); if none can be read, check its cable and power"
+)
+"""Advice where one feature fails: only the camera's manual says why."""
 
 
 class AravisFeatures:
@@ -103,7 +108,7 @@ class AravisNode:
 
     @property
     def _available(self) -> bool:
-        with errors(self.name) as error:
+        with errors(self.name, FEATURE) as error:
             return bool(self._library.arv_device_is_feature_available(self._device, self._key, error))
 
     @property
@@ -117,14 +122,14 @@ class AravisNode:
         return True
 
     def read(self) -> Value:
-        with errors(f"read {self.name}") as error:
+        with errors(f"read {self.name}", FEATURE) as error:
             get = getattr(self._library, f"arv_device_get_{self._word}_feature_value")
             value = get(self._device, self._key, error)
         # ctypes returns None for a text that is empty or missing.
         return value.decode() if isinstance(value, bytes) else value or (0 if value is not None else "")
 
     def write(self, value: Value) -> None:
-        with errors(f"set {self.name} to {value!r}") as error:
+        with errors(f"set {self.name} to {value!r}", FEATURE) as error:
             if self.kind != "command":
                 given = value.encode() if isinstance(value, str) else value
                 put = getattr(self._library, f"arv_device_set_{self._word}_feature_value")
@@ -147,14 +152,14 @@ class AravisNode:
             if kind == b"pValue":
                 register = library.arv_gc_property_node_get_linked_node(child)
             elif kind in (b"CommandValue", b"pCommandValue"):
-                with errors(self.name) as error:
+                with errors(self.name, FEATURE) as error:
                     wanted = library.arv_gc_property_node_get_int64(child, error)
             child = library.arv_dom_node_get_next_sibling(child)
         if not register or wanted is None:
             return True
         if library.arv_gc_feature_node_get_actual_access_mode(register) not in (0, 2):
             return True
-        with errors(self.name) as error:
+        with errors(self.name, FEATURE) as error:
             name = library.arv_gc_feature_node_get_name(register)
             return bool(library.arv_device_get_integer_feature_value(self._device, name, error) != wanted)
 
@@ -164,7 +169,7 @@ class AravisNode:
         number = c_int64 if whole else c_double
         low, high = number(), number()
         try:
-            with errors(self.name) as error:
+            with errors(self.name, FEATURE) as error:
                 bounds = getattr(self._library, f"arv_device_get_{self.kind}_feature_bounds")
                 bounds(self._device, self._key, byref(low), byref(high), error)
         except CameraError:
@@ -174,7 +179,7 @@ class AravisNode:
         step = 0
         if whole:
             try:
-                with errors(self.name) as error:
+                with errors(self.name, FEATURE) as error:
                     increment = self._library.arv_device_get_integer_feature_increment
                     step = int(increment(self._device, self._key, error))
             except CameraError:
@@ -183,7 +188,7 @@ class AravisNode:
 
     def entries(self) -> list[str]:
         count = c_uint()
-        with errors(self.name) as error:
+        with errors(self.name, FEATURE) as error:
             found = self._library.arv_device_dup_available_enumeration_feature_values_as_strings(
                 self._device, self._key, byref(count), error
             )

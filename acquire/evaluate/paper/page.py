@@ -77,9 +77,17 @@ def draw(figure: PaperFigure, directory: Path, host: Busyness) -> Drawn:
 
 
 def write_page(
-    figures: Sequence[Drawn], studio: Studio, command: str, when: datetime, recording: str | None = None
+    figures: Sequence[Drawn],
+    studio: Studio,
+    command: str,
+    when: datetime,
+    recording: str | None = None,
+    missing: Sequence[str] = (),
 ) -> Path:
-    """Write ``index.html`` and ``summary.json`` of the drawn figures into the studio's directory."""
+    """Write ``index.html`` and ``summary.json`` of the drawn figures into the studio's directory.
+
+    ``missing`` are the figures still to be made: a page that says so remains if they never are.
+    """
     found = Counter(row["verdict"] for each in figures for row in each.facts["rows"])
     facts = {
         "when": when.isoformat(timespec="seconds"),
@@ -92,6 +100,7 @@ def write_page(
         # Also those that no row has: summary.json has the same keys for every choice of figures.
         "verdicts": {verdict: found[verdict] for verdict in get_args(Verdict)},
         "figures": [each.facts for each in figures],
+        "missing": list(missing),
     }
     text = json.dumps(facts, indent=2, allow_nan=False, ensure_ascii=False)
     (studio.directory / "summary.json").write_text(text + "\n", encoding="utf-8")

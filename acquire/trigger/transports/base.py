@@ -6,7 +6,10 @@ from typing import Protocol
 
 READ_WAIT_S = 0.05
 """How long one `Transport.read` may wait, and so how late its thread notices a request to end."""
-UDEV_HINT = "install the udev rule that comes with the firmware, or join the group dialout; then log in again"
+UDEV_HINT = (
+    "install the udev rule (acquire install-service --udev prints it and says how), or for a serial port "
+    "join the group dialout; then log in again"
+)
 
 
 class Transport(Protocol):
