@@ -15,7 +15,7 @@
                     └─ blinking          cosines: bandwidth, lamps, pursuit
                         └─ patterns      with curves; evidence, settling, darkness; beside_motion,
                                          joined
-    iterations     admm                  sign, tv, volume, ground, denoisers, kernels: its proximal steps
+    iterations     admm                  sign, tv, volume, ground, drift, denoisers, kernels: proximal steps
                     │
     judgement      estimates             what any solver returns
                     ├─ judge             residuals and warnings; sanity, aliasing

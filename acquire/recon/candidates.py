@@ -45,7 +45,7 @@ class Candidate:
     ``ground`` is the weight of a still ground behind a volume, relative to that of the volume; 0 is none.
     ``brightness``: times a free brightness of the whole scene; ``change``: the difference from the best
     still; ``fine``: solved at N_m = 1, then merged; ``robust``: samples with large residuals have less
-    weight.
+    weight. ``drift`` is the velocity of a volume's contents, see `VolumeTv`; () is none.
     """
 
     prior: Literal["still", "smooth", "volume", "cycle"]
@@ -59,6 +59,7 @@ class Candidate:
     robust: bool = False
     period_frames: float = 0.0
     speed_changes: tuple[float, ...] = ()
+    drift: tuple[float, ...] = ()
 
     def denoiser(self) -> Denoiser:
         """The denoiser of this prior."""
@@ -68,8 +69,8 @@ class Candidate:
             return Smooth(self.pace)
         cyclic = self.prior == "cycle"
         if self.ground:
-            return GroundedTv(self.pace, self.ground, cyclic=cyclic)
-        return VolumeTv(self.pace, cyclic=cyclic)
+            return GroundedTv(self.pace, self.ground, cyclic=cyclic, drift=self.drift)
+        return VolumeTv(self.pace, cyclic=cyclic, drift=self.drift)
 
     def basis(self, frames: int, arrays: Arrays) -> TemporalBasis | CyclicBasis:
         """The temporal basis of its coefficients."""

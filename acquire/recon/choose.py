@@ -36,6 +36,7 @@ from acquire.recon.blinking import (
 )
 from acquire.recon.candidates import CALM, GROUNDED, SMOOTH, STILL, VOLUME
 from acquire.recon.cycle import TRIED_CHANGES, find_period
+from acquire.recon.drift import drift_of
 from acquire.recon.estimates import Preferred, Refined
 from acquire.recon.given import Given
 from acquire.recon.holdout import HeldOut
@@ -206,8 +207,8 @@ def _search(bench: Workbench, tried: _Tried, trials: int, rival: float) -> Trial
     calm = bench.attempt(bench.fitting(CALM), FIRST_ITERATIONS, plain)
     smooth = tried.smooth or bench.attempt(bench.fitting(SMOOTH), FIRST_ITERATIONS)
     grounded = bench.attempt(bench.fitting(GROUNDED), FIRST_ITERATIONS)
-    volumes = (tried.volume, calm, grounded, tried.cycle)
-    volume = min((each for each in volumes if each is not None), key=_error)
+    volume = _or_drifting(min(tried.volume, calm, grounded, key=_error), rival)
+    volume = min(volume, tried.cycle or volume, key=_error)
     bright = tried.bright
     # To a brightness, a flash in front of a still is the flash of everything.
     flickers = bright is not None and bench.held_out.clearly_less(bright.errors, plain.errors)
@@ -219,13 +220,16 @@ def _search(bench: Workbench, tried: _Tried, trials: int, rival: float) -> Trial
         merge = bench.given.options.spatial_merge
         still = best_still(plain, trials, merge=merge) if explains else bench.climb(plain, trials)
         if not bench.clock.spent(SEARCH_SHARE):
-            candidate = replace(weighted_like(still, bench.fitting(VOLUME)), change=True)
+            like = weighted_like(still, bench.fitting(VOLUME))
+            candidate = replace(like, change=True, drift=volume.candidate.drift)
             change = change_bench(bench, still).attempt(candidate, FIRST_ITERATIONS)
             volume = min((volume, change), key=_error)
     if volume.error < FAR * rival:
         volume = volume.bench.climb(volume, trials)
         if volume.candidate.brightness:
             volume = volume.bench.follow_brightness(volume)
+        if volume.candidate.drift:
+            volume = volume.bench.follow_drift(volume)
         if volume.candidate.period_frames:
             volume = volume.bench.follow_speed(volume)
     if smooth.error < FAR * min(volume.error, rival):
@@ -238,6 +242,15 @@ def _search(bench: Workbench, tried: _Tried, trials: int, rival: float) -> Trial
     moving = smooth if flows else volume
     most = 1 - GAIN_OF_WEAKER if moving.candidate.change else MOVING
     return moving if moving.error < most * still.error else still
+
+
+def _or_drifting(volume: Trial, rival: float) -> Trial:
+    """The volume, or the same that follows what moves in it at one velocity, if that predicts better."""
+    bench, drift = volume.bench, drift_of(volume)
+    if not drift or bench.clock.spent(SEARCH_SHARE):
+        return volume
+    found = bench.probe(replace(volume.candidate, drift=drift), min(volume.error, rival))
+    return min(volume, found, key=_error)
 
 
 def _worth_refining(bench: Workbench, cosines: InBand, best: Trial) -> bool:

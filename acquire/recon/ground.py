@@ -5,7 +5,8 @@
 Total variation of a volume counts the edges of a still texture once at every instant, √K times those of its
 coefficient, so that a weight that holds back the noise of what moves erases the ground behind it. Here it is
 moved to G, of which every line shows all. Nothing has to be known of the ground: it is part of the minimum
-(an infimal convolution; Chambolle and Lions, Numer. Math. 76, 167 (1997)).
+(an infimal convolution; Chambolle and Lions, Numer. Math. 76, 167 (1997)). The ground is at rest, even if
+the volume drifts.
 """
 
 from __future__ import annotations
@@ -30,8 +31,10 @@ class GroundedTv(VolumeTv):
     solver's iterations are theirs, too.
     """
 
-    def __init__(self, pace: float, ground: float, *, cyclic: bool = False) -> None:
-        super().__init__(pace, cyclic=cyclic)
+    def __init__(
+        self, pace: float, ground: float, *, cyclic: bool = False, drift: tuple[float, ...] = ()
+    ) -> None:
+        super().__init__(pace, cyclic=cyclic, drift=drift)
         self.ground = ground
         self._still_tv = FrameTv(ITERATIONS)
         self._still: Array = None

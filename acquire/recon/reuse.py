@@ -38,7 +38,8 @@ class Choice:
 
     ``prior`` is that of a candidate, or `COSINES_PRIOR`, of which only the number is handed over.
     ``brightness`` is the number of cosines of the whole scene's brightness, 0 if that is constant,
-    ``period_frames`` that of a cycle, which the next part fits to its own lines.
+    ``period_frames`` that of a cycle and ``drift`` a volume's velocity in sides of the picture per frame,
+    which the next part fits to its own lines.
     """
 
     prior: str
@@ -51,6 +52,7 @@ class Choice:
     fine: bool = False
     period_frames: float = 0.0
     ground: float = 0.0
+    drift: tuple[float, ...] = ()
 
     @classmethod
     def of(cls, result: Reconstruction) -> Self | None:
@@ -75,6 +77,7 @@ class Choice:
             fine=bool(found.get("fine")),
             period_frames=found.get("period_frames", 0.0),
             ground=found.get("ground", 0.0),
+            drift=tuple(each / len(result.video) for each in found.get("drift", ())),
         )
 
     def fits(self, error: float, noise: float) -> bool:
@@ -100,7 +103,8 @@ class Choice:
         """The candidate to try on this many frames."""
         cosines = min(self.coefficients, frames)
         bright, fine = bool(self.brightness), self.fine
-        known = {"brightness": bright, "fine": fine, "period_frames": self.period_frames}
+        drift = tuple(each * frames for each in self.drift)
+        known = {"brightness": bright, "fine": fine, "period_frames": self.period_frames, "drift": drift}
         return Candidate(self.prior, cosines, self.weight, self.pace, self.ground, **known)  # type: ignore[arg-type]  # not cosines
 
 
@@ -130,6 +134,8 @@ def reuse_choice(bench: Workbench, trials: int) -> Estimate | None:
         if bright is None or not bright.error < still.error:
             return None
     moving = bench.attempt(choice.candidate(frames), FIRST_ITERATIONS, bright)
+    if choice.drift:
+        moving = bench.follow_drift(moving)
     if choice.period_frames:
         # What was handed over had more iterations.
         moving = bench.follow_speed(moving)

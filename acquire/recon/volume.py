@@ -6,7 +6,7 @@ over as many instants as there are cosines. An edge that moves is one surface in
 than one at rest, although all its coefficients are large; light that blinks in place costs twice its contrast
 in every period. So it suits moving objects, and coefficient frames (`tv.FrameTv`) suit those that blink.
 ``pace`` is μ: the higher it is, the less a scene may change. Of motion that repeats, the volume is one cycle,
-whose end meets its beginning.
+whose end meets its beginning. What drifts across the picture can be followed (`drift`).
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ from array_api_compat import is_numpy_array
 from acquire.arrays import Arrays, namespace
 from acquire.errors import UsageError
 from acquire.recon.basis import CyclicBasis, TemporalBasis
+from acquire.recon.drift import Path
 from acquire.recon.kernels import SMALLEST_WEIGHT, volume_prox, volume_prox_parallel
 from acquire.recon.tv import ahead, layer
 
@@ -34,24 +35,36 @@ class VolumeTv:
     """Isotropic 3-D TV of the first K cosines' volume on K instants, as a denoiser of their coefficients.
 
     If it is ``cyclic``, the coefficients are those of a `CyclicBasis`, and the instants those of one cycle.
+    ``drift`` is the velocity (rows, columns) of the volume's contents in sides of the picture over all
+    instants, along which changes are counted; () is none.
     The transform between coefficients and instants is orthonormal, so that the prox of one is the prox of the
     other. ``prox`` is approximate: ``iterations`` of fast gradient projection (Beck and Teboulle, IEEE
     Trans. Image Process. 18, 2419 (2009)) from where the last call ended.
     """
 
-    def __init__(self, pace: float = 1.0, iterations: int = 6, *, cyclic: bool = False) -> None:
+    def __init__(
+        self,
+        pace: float = 1.0,
+        iterations: int = 6,
+        *,
+        cyclic: bool = False,
+        drift: tuple[float, ...] = (),
+    ) -> None:
         if not 0 <= pace < math.inf:
             raise UsageError(
                 f"a volume's total variation cannot have pace {pace}", possible="a number of at least 0"
             )
         if iterations < 1:
             raise UsageError(f"the TV prox cannot have {iterations} iterations", possible="1 or more")
-        self.pace, self.iterations, self.cyclic = pace, iterations, cyclic
+        self.pace, self.iterations, self.cyclic, self.drift = pace, iterations, cyclic, drift
         self._dual: Array = None
         self._instants: Array = None
+        self._path: Path | None = None
 
     def resume(self, other: VolumeTv) -> None:
-        """Start from the dual field of another, whatever its pace."""
+        """Start from the dual field of another, whatever its pace, unless it stood still or drifted."""
+        if bool(self.drift) != bool(other.drift):
+            return
         self._instants = other._instants
         self._dual = None if other._dual is None else namespace(other._dual).asarray(other._dual, copy=True)
 
@@ -60,9 +73,11 @@ class VolumeTv:
         xp, weight = namespace(frames), _one(weight)
         if weight < SMALLEST_WEIGHT:
             return frames
+        count = frames.shape[0]
+        if self.drift and self._path is None:
+            self._path = Path(self.drift, count, frames.shape[1], frames)
         if self._dual is None:
             self._dual = xp.stack([xp.zeros_like(frames)] * 3)
-            count = frames.shape[0]
             # It is computed in float64, so that frames of float64 do not get cosines that are rounded to
             # float32.
             exact = Arrays(dtype="float64")
@@ -73,12 +88,14 @@ class VolumeTv:
             ).matrix()
             self._instants = xp.asarray(matrix, dtype=frames.dtype, device=frames.device)
         volume = xp.tensordot(self._instants.T, frames, axes=1)
+        volume = volume if self._path is None else self._path.follow(volume)
         if is_numpy_array(volume):
             cleaned = np.empty_like(volume)
             clean = volume_prox if volume.size < PARALLEL_VOXELS else volume_prox_parallel
             clean(volume, weight, self.pace, self.cyclic, self._dual, self.iterations, cleaned)
         else:
             cleaned = self._prox_of_any(volume, weight)
+        cleaned = cleaned if self._path is None else self._path.restore(cleaned)
         return xp.tensordot(self._instants, cleaned, axes=1)
 
     def _prox_of_any(self, volume: Array, weight: float) -> Array:

@@ -21,6 +21,7 @@ from acquire.recon.basis import CyclicBasis, TemporalBasis, resized
 from acquire.recon.brightness import fit_brightness
 from acquire.recon.candidates import CALM, CYCLE, USUAL_ENERGY, VOLUME, Candidate, parameters
 from acquire.recon.cycle import FEWEST_HARMONICS, better_speed, most_harmonics
+from acquire.recon.drift import drift_of
 from acquire.recon.volume import VolumeTv
 
 if TYPE_CHECKING:
@@ -53,7 +54,7 @@ BRIGHTER = 0.9
 """Largest error of a volume of changing brightness, relative to that of a constant one, for which it is
 preferred."""
 SPEED_ROUNDS, MOST_CHANGES, LONG_STRIDE = 12, 3, 4.0
-"""Largest number of fits of a cycle's speed, in turn with the cycle; number of its changes; and how much
+"""Largest number of fits of a speed, in turn with what moves; number of changes of a cycle's; and how much
 farther than the fit says the speed is moved at first: a cycle adapts to a wrong one, which then looks nearly
 right."""
 WORTH_A_ROUND, MUCH_A_ROUND = 0.99, 0.9
@@ -254,6 +255,19 @@ class Workbench:
             if far or (stride == 1 and order == MOST_CHANGES):
                 break
             stride, order = (1.0, order) if stride > 1 else (LONG_STRIDE, MOST_CHANGES)
+        return best
+
+    def follow_drift(self, best: Trial) -> Trial:
+        """Find the velocity again, in the better video, as long as this improves the prediction."""
+        for _ in range(SPEED_ROUNDS):
+            drift = drift_of(best)
+            if not drift or self.clock.spent(SEARCH_SHARE):
+                break
+            found = self.attempt(replace(best.candidate, drift=drift), NEXT_ITERATIONS, best)
+            gained = found.error < WORTH_A_ROUND * best.error
+            best = min(best, found, key=lambda trial: trial.error)
+            if not gained:
+                break
         return best
 
     def _fit_brightness(self, video: NDArray[Any], brightness: NDArray[Any] | None, cosines: int) -> None:

@@ -24,13 +24,14 @@ def settled(denoiser: VolumeTv, theta: np.ndarray, calls: int = 400) -> np.ndarr
     return np.asarray(cleaned)
 
 
+@pytest.mark.parametrize("drift", [(), (0.4, -0.25)])
 @pytest.mark.parametrize("weight", [0.1, 0.5])
-def test_a_still_costs_its_own_total_variation(weight: float) -> None:
-    """Of light that never changes, all is the ground's: its prox is that of one frame."""
+def test_a_still_costs_its_own_total_variation(weight: float, drift: tuple[float, ...]) -> None:
+    """Of light that never changes, all is the ground's: its prox is that of one frame, whatever drifts."""
     theta = np.zeros((7, 8, 8), np.float32)
     theta[0] = np.random.default_rng(0).random((8, 8))
     expected = FrameTv(3000).prox(theta[:1], WEIGHT * weight * 7**0.5)
-    cleaned = settled(GroundedTv(PACE, weight), theta)
+    cleaned = settled(GroundedTv(PACE, weight, drift=drift), theta)
     np.testing.assert_allclose(cleaned[:1], expected, atol=2e-3)
     np.testing.assert_allclose(cleaned[1:], 0, atol=2e-3)
 
