@@ -57,11 +57,7 @@ def check_new_path(path: Path) -> None:
         why, hint = no
         raise UsageError(f"{path}: {why}", hint=hint)
     if not os.access(path.parent, os.W_OK | os.X_OK):
-        why, hint = "not writable for this user", "its permissions, or another directory"
-        with suppress(OSError):
-            if os.statvfs(path.parent).f_flag & os.ST_RDONLY:
-                why = "on a disk that is mounted read-only"
-                hint = "a directory on another disk, or mount this one for writing"
+        why, hint = _not_writable(path.parent)
         raise UsageError(f"{path}: the directory {path.parent} is {why}", hint=hint)
     inside = path.parent.resolve()
     for directory in (inside, *inside.parents):
@@ -89,6 +85,17 @@ def no_directory(path: Path) -> tuple[str, str] | None:
             kind = "a file" if way.is_file() else "something else"
             return f"{way} is {kind} and not a directory", "a path in a directory"
     return f"the directory {path} does not exist", "create it first"
+
+
+def _not_writable(directory: Path) -> tuple[str, str]:
+    """Return why nothing can be created in ``directory``, and what to try."""
+    with suppress(OSError):
+        if os.statvfs(directory).f_flag & os.ST_RDONLY:
+            return (
+                "on a disk that is mounted read-only",
+                "a directory on another disk, or mount this one for writing",
+            )
+    return "not writable for this user", "its permissions, or another directory"
 
 
 def write_all(fd: int, parts: Sequence[Buffer], offset: int) -> None:
