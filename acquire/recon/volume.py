@@ -62,7 +62,7 @@ class VolumeTv:
         self._path: Path | None = None
 
     def resume(self, other: VolumeTv) -> None:
-        """Start from the dual field of another, whatever its pace, unless it stood still or drifted."""
+        """Start from the dual field of another, whatever its pace, unless only one of them drifts."""
         if bool(self.drift) != bool(other.drift):
             return
         self._instants = other._instants
