@@ -108,3 +108,13 @@ def test_text_that_scrolls_is_followed(monkeypatch: pytest.MonkeyPatch) -> None:
     assert before.parameters["drift"] == ()
     assert found.quality.prediction < 0.8 * before.quality.prediction
     assert psnr(found.video[found.trusted], truth) > psnr(before.video[before.trusted], truth) + 1.5
+
+
+def test_fast_motion_gets_the_cosines_that_its_finest_wave_takes() -> None:
+    recorded = record("text", 1301, stages=40, lines=180)
+    found = reconstruct(recorded.segment, 2, 1, preset="fast")  # whose search has no time to arrive there
+    moving = [each for each in found.parameters["candidates"] if each.get("drift")]
+    side = found.video.shape[1]
+    wanted = max(map(abs, moving[0]["drift"])) * side
+    assert moving[0]["coefficients"] < wanted
+    assert any(each["coefficients"] >= wanted for each in moving)
