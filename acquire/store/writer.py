@@ -49,8 +49,8 @@ if TYPE_CHECKING:
 OWN_INTERVAL_S = 1.0
 """How much older than the root the own metadata of a group or an array may be."""
 
-RESERVE_BYTES = 2**20
-"""Bytes kept free for the metadata of the end: more than the tables and the root take."""
+RESERVE_BYTES = 2**21
+"""Bytes kept free for the metadata of the end: more than the tables (`table.TEXT_BYTES`) and the root take."""
 
 
 class RecordingWriter:
@@ -300,6 +300,11 @@ class RecordingWriter:
     def beyond_bytes(self) -> int:
         """Bytes by which held lines exceed the limit of retention, as of the latest commit."""
         return self._keeper.beyond_bytes if self._keeper else 0
+
+    @property
+    def events_not_listed(self) -> int:
+        """Number of events that found no room in their table."""
+        return self._events.not_listed
 
     def seal(self, condition: RunCondition, end_reason: str, ledger: dict[str, Any]) -> None:
         """Write the waiting lines, pad their chunk with 0, end the recording, and force it to the medium.

@@ -20,6 +20,7 @@ from waiting import until
 from acquire.errors import DataError, StoreError, UsageError
 from acquire.lines import ARMS
 from acquire.store import (
+    Circumstances,
     RecordingWriter,
     RunCondition,
     choose_codec,
@@ -35,6 +36,7 @@ from acquire.store.delivery import whole_file
 from acquire.store.files import Disk, ShardFile, write_all
 from acquire.store.pages import PAGE, aligned_bytes, is_aligned, open_direct
 from acquire.store.shape import CODECS
+from acquire.store.table import EVENT_ROWS, GAP_ROWS
 
 BIG = make_spec(pixels=1024, chunk_lines=64, shard_chunks=4, codec="none")
 """Chunks of 128 KiB: large enough for direct I/O."""
@@ -97,6 +99,40 @@ def test_on_a_full_disk_a_hold_leaves_nothing_and_a_recovery_has_its_reserve(sma
     assert recover(path).lines == lines
     assert open_recording(path).state == "sealed"
     assert verify(path).intact
+
+
+@pytest.mark.needs_mount
+@pytest.mark.parametrize("text", ["the valve opens " * 25, "\N{BUG}" * 400])
+@pytest.mark.parametrize("killed", [False, True])
+def test_however_many_marks_there_are_the_end_finds_room_on_a_full_disk(small_disk, text, killed):
+    """Their table had outgrown what is reserved for the end: the recording stayed open."""
+    path, texts = small_disk / "r.zarr", [f"{number} {text}" for number in range(EVENT_ROWS)]
+    with RecordingWriter.create(path, make_spec()) as writer:
+        fill(writer, 150)
+        for number in range(200):
+            writer.add_event("mark", number, 1000, texts[number])
+        writer.commit()
+        with contextlib.suppress(OSError), (small_disk / "rest").open("wb", buffering=0) as rest:
+            while rest.write(bytes(4096)):
+                pass
+        for number in range(200, EVENT_ROWS):
+            writer.add_event("mark", number, 1000, texts[number])
+        for _ in range(GAP_ROWS + 3):
+            writer.add_gap("a", 1020, 1, "camera")
+        with pytest.raises(DataError, match="No space left on device"):
+            writer.commit()
+        lines = writer.committed_lines
+        if not killed:
+            writer.seal(RunCondition.ABORTED, "disk full", {})
+    if killed:
+        recover(path, known=Circumstances(notes=tuple((1000, "mark", text) for text in texts)))
+    found = open_recording(path)
+    assert (found.state, found.lines) == ("sealed", lines)
+    listed = [event.text for event in found.events if event.kind == "mark"]
+    assert 600 < len(listed) < EVENT_ROWS
+    assert listed == texts[: len(listed)]
+    assert found.events_not_listed == EVENT_ROWS - len(listed)
+    assert "of the last events found no room in the table" in found.info()["tables_lack"][0]
 
 
 @pytest.mark.needs_mount
