@@ -50,7 +50,7 @@ OWN_INTERVAL_S = 1.0
 """How much older than the root the own metadata of a group or an array may be."""
 
 RESERVE_BYTES = 2**21
-"""Bytes kept free for the metadata of the end: more than the tables (`table.TEXT_BYTES`) and the root take."""
+"""Bytes kept free for the metadata of the end: more than tables (`table.TEXT_BYTES`) and root take."""
 
 
 class RecordingWriter:
