@@ -270,7 +270,7 @@ class RecordingWriter:
             # A new object is a new query: a shortage is made up for once, and not again at each commit until
             # the next.
             looked, self._looked = self._looked is not room, room
-            going = self._keeper.choose(rows, -room.free_bytes if looked else 0) if self._keeper else []
+            going = self._keeper.choose(rows, room.missing_bytes if looked else 0) if self._keeper else []
             if looked:
                 self._stuck = room.full and not going
             # Before the root, so that one that is rebuilt from the copy never claims lines that are deleted.
