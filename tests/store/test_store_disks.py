@@ -28,8 +28,10 @@ from acquire.store import (
     hold,
     measure_disk,
     open_recording,
+    open_video,
     recover,
     verify,
+    write_video,
 )
 from acquire.store.array_writer import ArrayWriter
 from acquire.store.delivery import whole_file
@@ -149,6 +151,31 @@ def test_the_watch_ends_a_recording_before_the_disk_is_full(small_disk, monkeypa
     assert "disk nearly full" in recording.attrs["end_reason"]
     assert recording.attrs["ledger"]["store"]["disk_error"] is None
     assert verify(path).intact
+
+
+@pytest.mark.parametrize("fsync", ["seal", "commit"])
+def test_the_directory_of_recordings_may_be_a_link(tmp_path, fsync):
+    """As /data often is: its recordings could not be sealed."""
+    (tmp_path / "mounted").mkdir()
+    (tmp_path / "data").symlink_to("mounted")
+    path, left = tmp_path / "data" / "r.zarr", tmp_path / "data" / "left.zarr"
+    with RecordingWriter.create(path, make_spec(fsync=fsync)) as writer:
+        fill(writer, 150)
+        writer.seal(RunCondition.GOOD, "done", {})
+    with RecordingWriter.create(left, make_spec(fsync=fsync)) as writer:
+        fill(writer, 150)
+        writer.commit()
+    recover(left)
+    for one in (path, left):
+        assert open_recording(one).state == "sealed"
+        assert verify(one).intact
+    place = tmp_path / "data" / "v.zarr"
+    video = np.zeros((4, 6, 6), np.float32)
+    write_video(place, video, np.arange(4), pixel_size=1.0, frame_interval_ns=1.0, provenance={})
+    assert len(open_video(place).time_ns) == 4
+    with whole_file(tmp_path / "data" / "file") as file:
+        file.write_bytes(b"whole")
+    assert (tmp_path / "mounted" / "file").read_bytes() == b"whole"
 
 
 def test_chunks_go_past_the_page_cache_where_that_can_be(path):
