@@ -9,11 +9,11 @@ import pytest
 import zarr
 from store_helpers import Truth, fill, make_spec
 
-from acquire.errors import DataError, UsageError
+from acquire.errors import DataError, PlaceError, UsageError
 from acquire.store import RecordingWriter, Retention, RunCondition, hold, open_recording, recover, verify
 from acquire.store.files import Disk
 from acquire.store.removal import COPY, shard_files
-from acquire.store.retention import Keeper, shard_bytes
+from acquire.store.retention import Keeper, keep_from, shard_bytes
 from acquire.store.room import RoomWatch
 
 SHARD = 64
@@ -212,6 +212,16 @@ def test_a_reserve_that_is_smaller_than_one_step_holds(path, always_looking, oth
         written += 400
         disk.free -= 400 + others
     assert reserve < disk.free <= reserve + 400 + others
+
+
+def test_a_copy_holds_nothing_where_a_recording_was_moved_away(path, tmp_path):
+    """It made directories there, which looked like a recording that had lost its lines."""
+    with RecordingWriter.create(path, spec_of(None)) as writer:
+        grow(writer, SHARD)
+        path.rename(tmp_path / "moved.zarr")
+        with pytest.raises(PlaceError, match="cannot be held: No such file or directory"):
+            keep_from(path, 1000, "file:///far/r.zarr")
+    assert not path.exists()
 
 
 def test_of_an_endless_recording_on_a_full_disk_what_it_writes_counts(path, always_looking):
