@@ -172,6 +172,7 @@ def take(client: Client, rig: TimedRig, directory: Path, name: str, seconds: flo
     return {
         "lost": lost,
         "condition": status.last.condition,
+        **({} if status.last.condition == "GOOD" else {"because": status.last.end_reason}),
         "lines": status.last.lines,
         "rate_hz": rate,
         "p50_ms": p50,

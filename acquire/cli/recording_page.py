@@ -111,7 +111,7 @@ def recording_facts(facts: dict[str, Any]) -> dict[str, Any]:
         "disk": _disk(facts["disk"]),
         "at risk": _at_risk(facts["durability"]),
         "lost lines": lost,
-        "lost of tables": "; ".join(facts["tables_lost"].values()) or None,
+        "incomplete": "; ".join(facts["tables_lack"]) or None,
         "tainted by": _some(taint_words(facts["ledger"].get("tainted_by", {}))),
         "in doubt": doubts,
         "calibration": calibration,

@@ -120,6 +120,11 @@ class RecordingConfig(FrozenModel):
         "'tdi-acquire[remote]'",
     )
 
+    @property
+    def reserve_bytes(self) -> int:
+        """Bytes of the disk to leave free."""
+        return round(self.reserve_gb * 1e9)
+
     @field_validator("upload_to")
     @classmethod
     def _is_a_place(cls, url: str | None) -> str | None:

@@ -2,7 +2,7 @@
 
 ::
 
-    Uploads ──▶ Copy, Reach                     the growing recording, one shard at a time ──┐
+    Uploads ──▶ Copy, Reach, Leave              the growing recording, one shard at a time ──┐
     copier  ──▶ UploadStatus, Reached           the others, while it has nothing new ────────┴▶ Mirror
 
 It runs at low priority, and the capture never waits for it: lines that are not copied yet are on the local
@@ -17,6 +17,7 @@ import math
 import select
 import time
 from dataclasses import dataclass, field
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from acquire.daemon.messages import ErrorMessage, UploadStatus
@@ -63,6 +64,13 @@ class Reach:
     """Find out whether the store accepts files; ``number`` identifies the query."""
 
     number: int
+
+
+@dataclass(frozen=True, slots=True)
+class Leave:
+    """Leave so many bytes of the recordings' disk free from now on; see `copy_recordings`."""
+
+    reserve_bytes: int
 
 
 @dataclass(frozen=True, slots=True)
@@ -165,6 +173,8 @@ class Copier:
                 self.add(message.path, ours=message.ours)
             elif isinstance(message, Reach):
                 self._mailbox.post(self._reach(message.number))
+            elif isinstance(message, Leave):
+                self._reserve_bytes = message.reserve_bytes
 
     def add(self, path: Path, *, ours: bool) -> None:
         """Add a recording to the list; one that is waiting already is tried at once."""
@@ -200,18 +210,22 @@ class Copier:
             self._put_off(job, "it is open, and not recovered yet", f"acquire recover {job.path}")
             return False
         job.lock.enter_context(only_copy(job.path))
-        # Reading messages before each write ends the copy soon after its owner has gone.
-        job.mirror = Mirror(job.path, job.status.url, pause=self._read_messages)
+        job.mirror = Mirror(job.path, job.status.url, pause=partial(self._before_write, job))
         return True
 
-    def _advance(self, job: Job, mirror: Mirror) -> None:
+    def _before_write(self, job: Job, size: int) -> None:
+        """Read messages, which ends the copy soon after its owner has gone; refuse to use the reserve."""
+        self._read_messages()
         # What recordings leave free is for their ends and recoveries, and not for copies of them.
         home = job.path.parent
-        if shares_disk(self._target, home) and DISK.free_bytes(home) <= self._reserve_bytes:
+        if shares_disk(self._target, home) and DISK.free_bytes(home) - size <= self._reserve_bytes:
             raise StoreError(
-                f"{job.status.url} is on the recordings' disk, of which only recording.reserve_gb is free",
+                f"{job.status.url} is on the recordings' disk, and {size} bytes more would leave less than "
+                "recording.reserve_gb free",
                 hint="free space there, or recording.upload_to on another disk",
             )
+
+    def _advance(self, job: Job, mirror: Mirror) -> None:
         done = mirror.step(most_shards=1)
         before, job.shards = job.shards, done.shards
         job.tries, job.grows = 0, mirror.grows

@@ -36,7 +36,7 @@ def disk_watch(config: RigConfig) -> DiskWatch:
     per_s = len(ARMS) * line_bytes * config.passing_hz
     if shares_disk(config.recording.upload_to, config.recording.directory.absolute()):
         per_s *= 2  # the copies fill it as well
-    return DiskWatch(config.recording.directory.absolute(), round(config.recording.reserve_gb * 1e9), per_s)
+    return DiskWatch(config.recording.directory.absolute(), config.recording.reserve_bytes, per_s)
 
 
 class DiskWatch:

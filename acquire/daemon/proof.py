@@ -17,7 +17,7 @@ from acquire.capacity.parts import measure_parts
 from acquire.cores import usable_cores
 from acquire.daemon.messages import CapacityStatus
 from acquire.daemon.storage import choose_for
-from acquire.errors import DataError, UsageError
+from acquire.errors import StoreError, UsageError
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -45,7 +45,7 @@ class Proof:
         self._measured: tuple[float, Parts] | None = None
 
     def choose(self, config: RigConfig) -> CodecChoice:
-        """Return the measured codec for the rig, kept for some minutes. Raises DataError."""
+        """Return the measured codec for the rig, kept for some minutes. Raises as `choose_for` does."""
         now_s = time.monotonic()
         if self._chosen is None or now_s - self._chosen[0] > VALID_S:
             self._chosen = now_s, choose_for(config)
@@ -63,7 +63,7 @@ class Proof:
             self._chosen = self._measured = None
         try:
             parts = self._parts(progress)
-        except (UsageError, DataError) as error:
+        except (UsageError, StoreError) as error:
             log.warning("capacity: it cannot be measured: %s", error)
             rate_hz = self._config.passing_hz
             return CapacityStatus(line_rate_hz=rate_hz, warning=f"not measured: {error}")

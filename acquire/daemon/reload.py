@@ -33,7 +33,7 @@ AT_ONCE, NEXT_RECORDING, NEXT_START = "at once", "from the next recording on", "
 MAY_CHANGE = {
     "hooks": AT_ONCE,
     "recording.after": AT_ONCE,
-    "recording.reserve_gb": NEXT_RECORDING,
+    "recording.reserve_gb": f"{NEXT_RECORDING}, and for copies at once",
     "recording.retention": NEXT_RECORDING,
     "service.begin": NEXT_START,
     "service.log_level": AT_ONCE,

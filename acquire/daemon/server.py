@@ -82,7 +82,7 @@ def serve(config: RigConfig, origin: str = "", reread: Callable[[], RigConfig] |
         salvage = Salvage(directory, journal_path(directory, config.name, "recordings"))
         salvage.search()
         journal = journal_path(directory, config.name, "uploads")
-        uploads = Uploads(config.recording.upload_to, journal, round(config.recording.reserve_gb * 1e9))
+        uploads = Uploads(config.recording.upload_to, journal, config.recording.reserve_bytes)
         uploads.begin()
         proof = Proof(config)
 

@@ -197,12 +197,10 @@ class Service:
             self._publish()
 
     def reconfigure(self, config: RigConfig, text: str) -> None:
-        """Use ``config`` from now on, of which only permitted keys differ (`acquire.daemon.reload`).
-
-        ``text`` describes the changes, and is added to the events of the current recording.
-        """
+        """Use ``config``, of which only permitted keys differ; ``text`` tells the current recording which."""
         self.config = config
-        self._disk.keep(round(config.recording.reserve_gb * 1e9))
+        self._disk.keep(config.recording.reserve_bytes)
+        self._uploads.keep(config.recording.reserve_bytes)
         if self._run is not None:
             self._run.adopt(config.recording)
             if self._state in (State.RECORDING, State.DRAINING):

@@ -7,11 +7,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from acquire.errors import DataError
 from acquire.geometry import Geometry
 from acquire.lines import ARMS
 from acquire.store import Retention, choose_codec, measure_disk
-from acquire.store.refusals import CURES
+from acquire.store.refusals import refusal
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -47,7 +46,7 @@ def storage_settings(config: RigConfig) -> dict[str, Any]:
         "fsync": recording.fsync,
         "tag_chunks": config.tag_chunks,
         "commit_lines": ceil(recording.commit_s * rate_hz / whole) * whole,
-        "reserve_bytes": round(recording.reserve_gb * 1e9),
+        "reserve_bytes": recording.reserve_bytes,
         "retention": retention,
     }
 
@@ -58,7 +57,8 @@ def choose_for(
     """Choose the codec for both arms at full rate, by measurements of about a second.
 
     They use ``lines`` (line, pixel) like those to come, or shot noise at half the range, and the disk of
-    ``directory``, or of the rig's directory. Raises DataError if the disk cannot be written to.
+    ``directory``, or of the rig's directory. Raises StoreError if the disk cannot be written to, and
+    PlaceError if the directory is not there or this user may not.
     """
     sample = shot_noise(config) if lines is None else lines
     needed = len(ARMS) * config.line_rate_hz * sample[0].nbytes
@@ -66,10 +66,8 @@ def choose_for(
     try:
         return choose_codec(sample, needed, measure_disk(directory))
     except OSError as error:
-        cure = CURES.get(error.errno or 0, "the kernel's log for errors of the disk")
-        raise DataError(
-            f"the disk of {directory} cannot be measured: {error.strerror}",
-            hint=f"{cure}; or another [recording] directory",
+        raise refusal(
+            f"the disk of {directory}", error, "measured", "or another [recording] directory"
         ) from error
 
 

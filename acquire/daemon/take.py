@@ -88,9 +88,13 @@ class Take:
         return f"; marks of lines after its last one, of which only the log is sure to have all: {named}"
 
     def result(self, seen: CaptureStatus) -> LastRecording:
-        """Return the result for the daemon's status, once the recording has ended."""
+        """Return the result for the daemon's status, once the recording has ended, and log what it lacks."""
+        path = Path(seen.path or self.path)
+        if more := seen.ledger.get("events_not_listed"):
+            text = "%s does not list its last %d events: their table is full; this log has all marks"
+            log.warning(text, path, more)
         return LastRecording(
-            path=Path(seen.path or self.path),
+            path=path,
             lines=seen.committed_lines,
             condition=None if seen.condition is None else str(seen.condition),
             end_reason=seen.end_reason,

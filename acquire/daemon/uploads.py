@@ -18,7 +18,7 @@ import logging
 import time
 from typing import TYPE_CHECKING
 
-from acquire.daemon.copier import MOST_WAIT_S, Copy, Reach, Reached, copy_recordings, wait_s
+from acquire.daemon.copier import MOST_WAIT_S, Copy, Leave, Reach, Reached, copy_recordings, wait_s
 from acquire.daemon.journal import Journal
 from acquire.daemon.messages import UploadStatus
 from acquire.errors import AcquireError, ConfigError, DeviceError, UsageError
@@ -126,6 +126,11 @@ class Uploads:
     def forget(self, path: Path) -> None:
         """Note that a run begins to write there: an earlier recording there is gone."""
         self._ours.discard(path)
+
+    def keep(self, reserve_bytes: int) -> None:
+        """Set the bytes that copies on the recordings' disk leave free from now on."""
+        self._reserve_bytes = reserve_bytes
+        self._post(Leave(reserve_bytes))
 
     def renew(self, path: Path) -> None:
         """Bring a copy up to date, or begin it."""

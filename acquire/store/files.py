@@ -243,7 +243,7 @@ class Disk:
                     raise
 
     def sync_directory(self, path: Path) -> None:
-        """Force the entries of a directory to the medium."""
+        """Force the entries of a directory to the medium; it may be reached by a link, as /data often is."""
         _sync(path, os.O_DIRECTORY)
 
     def sync_tree(self, path: Path) -> None:
@@ -255,7 +255,8 @@ class Disk:
             for file in files:
                 with suppress(FileNotFoundError):
                     if kind_of(file.lstat().st_mode) is None:
-                        _sync(file)
+                        # A link out of the recording, or a pipe in it, must not hold the writer up.
+                        _sync(file, os.O_NOFOLLOW | os.O_NONBLOCK)
             try:
                 self.sync_directory(directory)
             except FileNotFoundError:
@@ -391,9 +392,8 @@ def _walk(path: Path) -> Iterator[tuple[Path, list[Path]]]:
         yield base, [base / name for name in names]
 
 
-def _sync(path: Path, flags: int = 0) -> None:
-    # A link out of the recording, or a pipe in it, must not hold the writer up.
-    fd = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK | flags)
+def _sync(path: Path, flags: int) -> None:
+    fd = os.open(path, os.O_RDONLY | os.O_CLOEXEC | flags)
     try:
         os.fsync(fd)
     finally:

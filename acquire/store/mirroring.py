@@ -165,11 +165,12 @@ def _identity_in(data: bytes) -> tuple[str, int] | None:
 class Mirror:
     """One copy; `step` brings it up to date.
 
-    ``pause`` is called before anything is written; it may raise to end the copy, to be continued later.
+    ``pause`` is called before anything is written, with its size in bytes; it may raise to end the copy, to
+    be continued later.
     """
 
     def __init__(
-        self, path: Path, url: str, disk: Disk = DISK, pause: Callable[[], None] = lambda: None
+        self, path: Path, url: str, disk: Disk = DISK, pause: Callable[[int], None] = lambda _: None
     ) -> None:
         self.path = path
         self.target = RemoteSource(url)
@@ -277,7 +278,7 @@ class Mirror:
                 key = file.relative_to(self.path).as_posix()
                 length = file.stat().st_size
                 if self._there.get(key) != length:
-                    self._make_way(key)
+                    self._make_way(key, length)
                     self.target.put_file(key, file)
                     self._there[key] = length
                     self._bytes += length
@@ -360,13 +361,13 @@ class Mirror:
         # Most of these files are the same from one step to the next, and each takes a store some time.
         if self._sent.get(key) == data:
             return
-        self._make_way(key)
+        self._make_way(key, len(data))
         self.target.put(key, data)
         self._sent[key] = data
         self._bytes += len(data)
 
-    def _make_way(self, key: str) -> None:
-        self._pause()
+    def _make_way(self, key: str, size: int) -> None:
+        self._pause(size)
         directory = key.rpartition("/")[0]
         if self.target.has_directories and directory not in self._directories:
             self.target.make_directory_of(key)

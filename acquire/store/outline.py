@@ -29,6 +29,12 @@ if TYPE_CHECKING:
     from acquire.store.source import Source
     from acquire.store.table_reader import Event, Gap
 
+_WITHOUT = {
+    "events": "marks and other events, or their texts, have been incomplete since a recovery",
+    "gaps": "the causes of lost lines have been incomplete since a recovery",
+}
+"""Table → what follows from its loss."""
+
 
 def open_outline(place: Path | str, document: Document | None = None) -> Outline:
     """Open a recording without its lines; raises as `acquire.store.open_recording` does.
@@ -212,6 +218,22 @@ class Outline:
         lost = self.attrs.get("tables_lost")
         return {str(name): str(text) for name, text in lost.items()} if isinstance(lost, dict) else {}
 
+    @property
+    def tables_lack(self) -> list[str]:
+        """What the tables of events and gaps do not have, and where else to find it, in words."""
+        found = [f"{_WITHOUT.get(name, name)}: {text}" for name, text in self.tables_lost.items()]
+        if self.events_not_listed:
+            found.append(
+                f"{self.events_not_listed} of the last events found no room in the table: "
+                "the daemon's log has all marks"
+            )
+        if self.gaps_not_listed:
+            found.append(
+                f"{self.gaps_not_listed} of the last gaps found no room in the table: "
+                "the ledger and the flags of the lines have all that were lost"
+            )
+        return found
+
     def info(self) -> dict[str, Any]:
         """Return a summary of the recording, as JSON; without the facts of a table that is `unreadable`."""
         period_ns, lines = self.line_period_ns, self.lines
@@ -241,6 +263,7 @@ class Outline:
             else {arm: sum(gap.count for gap in gaps if gap.arm == arm) for arm in ARMS},
             "events": None if "events" in self.unreadable else len(self.events),
             "tables_lost": self.tables_lost,
+            "tables_lack": self.tables_lack,
             "simulated": bool(self.attrs.get("simulated", False)),
             "cameras": self.attrs["cameras"],
             "imported": self.attrs.get("imported"),

@@ -78,7 +78,7 @@ def hold(path: Path, first_line: int, count: int, why: str = "", disk: Disk = DI
     refuse_link(path, directory)
     text = json.dumps({"first_line": first_line, "count": count, "why": why}).encode()
     try:
-        disk.make_directory(directory, parents=True)
+        _make(directory, disk)
         name = f"{first_line}-{count}.json"  # the same lines, held again, replace their file
         Publisher(directory / f".{name}", disk).replace(directory / name, text, durable=True)
     except OSError as error:
@@ -105,7 +105,7 @@ def keep_from(path: Path, line: int, url: str, disk: Disk = DISK) -> None:
     text = json.dumps({"first_line": line, "count": ALL_LINES, "why": _NOT_COPIED}).encode()
     refuse_link(path, _holds(path))
     try:
-        disk.make_directory(_holds(path), parents=True)
+        _make(_holds(path), disk)
         # A scratch file of its own, beside that of `hold`: the two are different processes.
         Publisher(_holds(path) / ".copy", disk).replace(_copy_hold(path, url), text, durable=True)
     except OSError as error:
@@ -262,6 +262,12 @@ def shard_bytes(path: Path, shard: int) -> int:
 
 def _holds(path: Path) -> Path:
     return path / ARMS[0] / "lines" / HOLDS
+
+
+def _make(directory: Path, disk: Disk) -> None:
+    # Without those above: of a recording that was moved they would be a new one that holds nothing.
+    with suppress(FileExistsError):
+        disk.make_directory(directory)
 
 
 def _copy_hold(path: Path, url: str) -> Path:

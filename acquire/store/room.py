@@ -20,20 +20,29 @@ MEMORY_S = 20.0
 
 @dataclass(frozen=True, slots=True)
 class Room:
-    """A disk at one moment: bytes free above the reserve, and bytes written per second."""
+    """A disk at one moment: bytes free above the reserve, and bytes written per second.
+
+    ``soon_bytes`` are expected to be written, by everybody, until the next look.
+    """
 
     free_bytes: int
     bytes_per_s: float
+    soon_bytes: int = 0
 
     @property
     def seconds_to_full(self) -> float:
         """Seconds until the disk is full; infinite while nothing is written."""
-        return max(0, self.free_bytes) / self.bytes_per_s if self.bytes_per_s > 0 else float("inf")
+        return max(0, -self.missing_bytes) / self.bytes_per_s if self.bytes_per_s > 0 else float("inf")
+
+    @property
+    def missing_bytes(self) -> int:
+        """Bytes by which the disk falls short of the reserve until the next look; negative: it does not."""
+        return self.soon_bytes - self.free_bytes
 
     @property
     def full(self) -> bool:
-        """Whether nothing is left but the reserve."""
-        return self.free_bytes <= 0
+        """Whether nothing would be left but the reserve."""
+        return self.missing_bytes >= 0
 
 
 class RoomWatch:
@@ -57,6 +66,10 @@ class RoomWatch:
             # An exponential mean, beginning with the first value.
             share = min(1.0, max(LOOK_S, elapsed) / MEMORY_S) if self._bytes else 1.0
             self._rate += share * ((bytes_written - self._bytes) / elapsed - self._rate)
+            free = self._disk.free_bytes(self._path) - self._reserve
+            # A fast camera, a busy host or a second recording take more between two looks than many reserves.
+            # Retention frees what this recording writes, so that its own bytes count as well as the fall.
+            soon = max(bytes_written - self._bytes, self.room.free_bytes - free if self._bytes else 0)
             self._bytes, self._begun_s, self._due_s = bytes_written, now, now + LOOK_S
-            self.room = Room(self._disk.free_bytes(self._path) - self._reserve, self._rate)
+            self.room = Room(free, self._rate, soon)
         return self.room

@@ -1,7 +1,7 @@
 """Small tables of a recording: one 1-D array per column, one chunk each, replaced whole at a commit.
 
-Rows are only ever added, so a reader with an older length still reads the same rows. A table has a capacity;
-rows beyond it are counted in the group's attribute ``not_listed``.
+Rows are only ever added, so a reader with an older length still reads the same rows. A table has a capacity,
+in rows and in bytes of text; rows beyond it are counted in the group's attribute ``not_listed``.
 """
 
 from __future__ import annotations
@@ -32,6 +32,9 @@ EVENT_KINDS = ("armed", "started", "stopped", "loss", "tag_mismatch", "fault", "
 
 MAX_TEXT = 500
 """Longest text of a cell; a longer one ends in an ellipsis."""
+
+TEXT_BYTES = 2**20
+"""Most bytes of all texts of a table: the end of a recording on a full disk has little more than that."""
 
 
 class Vocabulary:
@@ -76,6 +79,7 @@ class Table:
         self.directory = directory
         self.capacity = capacity
         self.not_listed = 0
+        self._text_bytes = 0
         self.dirty = True
         self._dimension = dimension
         self._columns = columns
@@ -85,17 +89,22 @@ class Table:
         return len(self._cells[self._columns[0].name])
 
     def add(self, row: Mapping[str, Any]) -> None:
-        """Add one row (column name → value), or count it if the table is full."""
+        """Add one row (column name → value), or count it if it finds no room."""
         self.dirty = True
-        if len(self) >= self.capacity:
+        texts = {
+            column.name: _shortened(row[column.name])
+            for column in self._columns
+            if column.data_type == "string"
+        }
+        size = sum(len(text.encode()) for text in texts.values())
+        if len(self) >= self.capacity or self._text_bytes + size > TEXT_BYTES:
             self.not_listed += 1
             return
+        self._text_bytes += size
         for column in self._columns:
-            value = row[column.name]
+            value = texts.get(column.name, row[column.name])
             if column.vocabulary is not None:
                 value = column.vocabulary.value(value)
-            elif column.data_type == "string" and len(value) > MAX_TEXT:
-                value = value[: MAX_TEXT - 1] + "…"
             self._cells[column.name].append(value)
 
     def create(self, disk: Disk) -> None:
@@ -146,6 +155,10 @@ class Table:
             codecs=[serializer, layout.CRC32C],
             attributes=column.describe(),
         )
+
+
+def _shortened(text: str) -> str:
+    return text if len(text) <= MAX_TEXT else text[: MAX_TEXT - 1] + "…"
 
 
 def gap_table(path: Path) -> Table:

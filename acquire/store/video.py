@@ -37,7 +37,7 @@ from acquire.store.video_writer import VideoWriter, check_provenance
 from acquire.text import cause_in_words, shortened
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Iterable, Mapping
     from pathlib import Path
 
     import zarr
@@ -136,6 +136,35 @@ class VideoFile:
         """Whether each of its chunks was written, also of darkness: one that is not there is lost."""
         return self.attrs.get(EVERY_CHUNK) is True
 
+    def missing(self) -> list[range]:
+        """Return the frames of which a file is not there, as far as `every_chunk` allows to tell."""
+        if not self.every_chunk:
+            return []
+        frames, size = self.video.shape[0], self.video.chunks[0]
+        gone = sorted(
+            {place[0] for place in np.ndindex(*self.video.cdata_shape) if not _is_there(self.video, place)}
+        )
+        return joined_ranges(range(at * size, min(frames, (at + 1) * size)) for at in gone)
+
+    def readable(self, first: int, stop: int) -> tuple[NDArray[Any], list[range]]:
+        """Read frames (t, y, x) as float32, NaN where they cannot be read, and return which these are.
+
+        Raises DataError if none can.
+        """
+        size, parts, lost = self.video.chunks[0], [], []
+        error = None
+        for start in (first, *range((first // size + 1) * size, stop, size)):
+            end = min(stop, (start // size + 1) * size)
+            try:
+                parts.append(self.frames(start, end).astype(np.float32))
+            except DataError as found:
+                error = error or found
+                parts.append(np.full((end - start, *self.video.shape[1:]), np.nan, np.float32))
+                lost.append(range(start, end))
+        if error is not None and len(lost) == len(parts):
+            raise error
+        return np.concatenate(parts), joined_ranges(lost)
+
     def _transformed(self, kind: str, default: float) -> tuple[float, float, float]:
         steps = self.attrs["ome"]["multiscales"][0]["datasets"][0]["coordinateTransformations"]
         found = next((step[kind] for step in steps if step["type"] == kind), [default] * 3)
@@ -164,8 +193,6 @@ def _read(array: zarr.Array[Any], some: slice, *, whole: bool) -> NDArray[Any]:
 
 def _check_there(array: zarr.Array[Any], values: NDArray[Any], some: slice) -> None:
     """Raise FileNotFoundError if a chunk that was read is not there: zarr returns its fill value instead."""
-    from zarr.core.sync import sync
-
     filled = np.isnan(values) if np.isnan(array.fill_value) else values == array.fill_value
     if not filled.any():
         return
@@ -179,10 +206,27 @@ def _check_there(array: zarr.Array[Any], values: NDArray[Any], some: slice) -> N
                 for at, size in zip(place[1:], array.chunks[1:], strict=True)
             ),
         ]
-        if inside.size and inside.all():
+        if inside.size and inside.all() and not _is_there(array, place):
             key = array.metadata.encode_chunk_key(place)
-            if not sync((array.store_path / key).exists()):
-                raise FileNotFoundError(f"its file {key} is missing")
+            raise FileNotFoundError(f"its file {key} is missing")
+
+
+def _is_there(array: zarr.Array[Any], place: tuple[int, ...]) -> bool:
+    """Return whether the file of a chunk is there."""
+    from zarr.core.sync import sync
+
+    return bool(sync((array.store_path / array.metadata.encode_chunk_key(place)).exists()))
+
+
+def joined_ranges(ranges: Iterable[range]) -> list[range]:
+    """Return ascending ranges with those that touch joined."""
+    found: list[range] = []
+    for one in ranges:
+        if found and found[-1].stop == one.start:
+            found[-1] = range(found[-1].start, one.stop)
+        else:
+            found.append(one)
+    return found
 
 
 def write_video(

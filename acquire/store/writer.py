@@ -49,8 +49,8 @@ if TYPE_CHECKING:
 OWN_INTERVAL_S = 1.0
 """How much older than the root the own metadata of a group or an array may be."""
 
-RESERVE_BYTES = 2**20
-"""Bytes kept free for the metadata of the end: more than the tables and the root take."""
+RESERVE_BYTES = 2**21
+"""Bytes kept free for the metadata of the end: more than tables (`table.TEXT_BYTES`) and root take."""
 
 
 class RecordingWriter:
@@ -270,7 +270,7 @@ class RecordingWriter:
             # A new object is a new query: a shortage is made up for once, and not again at each commit until
             # the next.
             looked, self._looked = self._looked is not room, room
-            going = self._keeper.choose(rows, -room.free_bytes if looked else 0) if self._keeper else []
+            going = self._keeper.choose(rows, room.missing_bytes if looked else 0) if self._keeper else []
             if looked:
                 self._stuck = room.full and not going
             # Before the root, so that one that is rebuilt from the copy never claims lines that are deleted.
@@ -300,6 +300,11 @@ class RecordingWriter:
     def beyond_bytes(self) -> int:
         """Bytes by which held lines exceed the limit of retention, as of the latest commit."""
         return self._keeper.beyond_bytes if self._keeper else 0
+
+    @property
+    def events_not_listed(self) -> int:
+        """Number of events that found no room in their table."""
+        return self._events.not_listed
 
     def seal(self, condition: RunCondition, end_reason: str, ledger: dict[str, Any]) -> None:
         """Write the waiting lines, pad their chunk with 0, end the recording, and force it to the medium.

@@ -66,6 +66,8 @@ class Writer(Protocol):
     @property
     def beyond_bytes(self) -> int: ...
     @property
+    def events_not_listed(self) -> int: ...
+    @property
     def packs(self) -> bool: ...
     def append(self, block: TaggedBlock, *, lent: bool = False) -> None: ...
     def give_back(self, arm: str) -> None: ...
@@ -380,6 +382,7 @@ class Session:
             "cameras": self.cameras,
             "tainted_by": self._taints(),
             **({"code_verified_to": self.verified} if self.verified else {}),
+            **({"events_not_listed": more} if (more := self.writer.events_not_listed) else {}),
             **arms,
         }
 

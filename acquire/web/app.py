@@ -234,15 +234,18 @@ def _add_recordings(api: APIRouter, archive: Archive, reading: Reading, answers:
 
     @api.get(
         "/videos/{name}/frames",
-        summary="Consecutive frames, 8 bits per pixel",
+        summary="Consecutive frames, 8 bits per pixel; X-Unreadable-Frames lists those that are not there",
         responses=BYTES,
         response_class=Response,
     )
     async def frames(
         name: str, first: Annotated[int, Query(ge=0)] = 0, count: Annotated[int, Query(ge=1, le=4096)] = 1
     ) -> Response:
-        content = await reading(lambda: archive.frames(name, first, count))
-        return Response(content, media_type="application/octet-stream", headers=NO_STORE)
+        content, lost = await reading(lambda: archive.frames(name, first, count))
+        # Of 8 bits none is left to mark a frame that cannot be read.
+        unreadable = ",".join(f"{frames.start}-{frames.stop - 1}" for frames in lost)
+        headers = {**NO_STORE, "X-Unreadable-Frames": unreadable}
+        return Response(content, media_type="application/octet-stream", headers=headers)
 
     @api.get("/cuts/{name}", summary="A range that was cut", responses=BYTES, response_class=Response)
     async def cut(name: str) -> FileResponse:

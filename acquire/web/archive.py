@@ -172,24 +172,28 @@ class Archive:
             # Black and white are the 0.1 % and 99.9 % quantiles of frames over the whole length.
             frames = video.video.shape[0]
             step = max(1, frames // SAMPLED_FRAMES)
-            values = np.stack([video.frames(k, k + 1) for k in range(0, frames, step)]).astype(np.float32)
+            values = _sampled(video, range(0, frames, step))
             known = values[np.isfinite(values)]  # nothing of a video that was interrupted early
             black, white = map(float, np.quantile(known, (0.001, 0.999))) if known.size else (0.0, 0.0)
             _remember(self._ranges, key, (black, white if white > black else black + 1.0), MOST_PICTURES)
         low, high = self._ranges[key]
-        return _video_facts(name, video).model_copy(update={"low": low, "high": high})
+        missing = [(frames.start, frames.stop) for frames in video.missing()]
+        return _video_facts(name, video).model_copy(update={"low": low, "high": high, "missing": missing})
 
-    def frames(self, name: str, first: int, count: int) -> bytes:
-        """Return consecutive 8-bit frames, as many as exist and fit into one answer."""
+    def frames(self, name: str, first: int, count: int) -> tuple[bytes, list[range]]:
+        """Return consecutive 8-bit frames, as many as exist and fit into one answer, and the unreadable ones.
+
+        Raises DataError if all of them are.
+        """
         facts, video = self.video(name), open_video(self.path_of(name))
         most = max(1, MOST_FRAME_BYTES // (facts.rows * facts.columns))
         if not 0 <= first < facts.frames:
             raise UsageError(f"{name} has no frame {first}", possible=f"0 to {facts.frames - 1}")
-        values = video.frames(first, first + min(count, most)).astype(np.float32)
+        values, lost = video.readable(first, min(facts.frames, first + min(count, most)))
         # Voxels of tiles that were not written are NaN, and shown black.
         scaled = np.nan_to_num((values - facts.low) * (255 / max(facts.high - facts.low, 1e-12)))
         content: bytes = np.clip(scaled, 0, 255).astype(np.uint8).tobytes()
-        return content
+        return content, lost
 
     def _entries(self, *, video: bool) -> Iterator[_Entry]:
         """Yield the directory's newest videos or recordings, newest first, `MOST_LISTED` at most.
@@ -316,7 +320,21 @@ def _facts(path: Path, opened: Outline) -> RecordingFacts:
         held=bool(info["holds"] or _new_holds(path, opened)),
         uploaded=upload_target(opened.attrs),
         damage=damage_in_words(opened),
+        incomplete=info["tables_lack"],
     )
+
+
+def _sampled(video: VideoFile, frames: range) -> NDArray[np.float32]:
+    """Return those of the frames that can be read. Raises DataError if none can."""
+    found, error = [], None
+    for number in frames:
+        try:
+            found.append(video.frames(number, number + 1).astype(np.float32))
+        except DataError as wrong:
+            error = error or wrong
+    if error is not None and not found:
+        raise error
+    return np.concatenate(found)
 
 
 def _arm_overview(opened: Recording, arm: str) -> NDArray[np.uint8]:

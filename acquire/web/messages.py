@@ -41,6 +41,7 @@ class RecordingFacts(Message):
     lost_lines: dict[str, int] | None = Field(default={}, description="null: the gaps cannot be read")
     tainted_by: list[Text] = Field(default=[], description="the reasons to doubt stored lines")
     events: int | None = Field(default=0, description="null: they cannot be read")
+    incomplete: list[Text] = Field(default=[], description="what its lists of events and gaps do not have")
     held: bool = Field(default=False, description="some of its lines are protected from retention")
     uploaded: Text | None = Field(default=None, description="URL to which it is copied")
     damage: Text | None = None
@@ -102,6 +103,9 @@ class VideoFacts(Message):
     )
     low: float = Field(default=0.0, description="value shown as black")
     high: float = Field(default=1.0, description="value shown as white")
+    missing: list[tuple[int, int]] = Field(
+        default=[], description="first and end of frames of which a file is not there"
+    )
     error: Text | None = None
 
 

@@ -252,6 +252,16 @@ def test_marks_are_taken_while_a_recording_drains(bed: Bed) -> None:
     assert (bed.state, bed.run.calls[-1]) == (State.DRAINING, ("note", "mark", "meanwhile"))
 
 
+def test_events_that_a_recording_does_not_list_are_counted_in_the_log(
+    bed: Bed, caplog: pytest.LogCaptureFixture
+) -> None:
+    bed.record()
+    bed.run.see(ledger={"events_not_listed": 12})
+    bed.service.stop()
+    bed.service.supervise()
+    assert "does not list its last 12 events" in caplog.text
+
+
 def test_hurry_ends_the_wait_and_the_run(bed: Bed) -> None:
     bed.run.seals_at_stop = False
     bed.record()

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import errno
+import os
+
 import pytest
 
 from acquire.config import load_rig
+from acquire.daemon.proof import Proof
 from acquire.daemon.storage import choose_for, shot_noise, storage_settings
-from acquire.errors import ConfigError
+from acquire.errors import AcquireError, ConfigError, PlaceError, StoreError
 
 
 def test_settings_follow_the_line_rate(tmp_path):
@@ -45,6 +49,24 @@ def test_a_codec_is_chosen_for_the_rig(tmp_path):
     assert choice.codec in ("none", "lz4", "zstd")
     assert choice.needed_megabytes_per_s == pytest.approx(1.5 * 2 * 33333.3 * 64 * 2 / 1e6, rel=1e-3)
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("number", "kind"), [(errno.ENOSPC, StoreError), (errno.EIO, StoreError), (errno.EACCES, PlaceError)]
+)
+def test_a_disk_that_cannot_be_measured_is_no_loss_of_data(tmp_path, monkeypatch, number, kind):
+    """It was DataError, and the exit code said that lines were lost."""
+
+    def refuse(*_: object, **__: object) -> None:
+        raise OSError(number, os.strerror(number))
+
+    monkeypatch.setattr("acquire.store.files._nameless", refuse)
+    rig = load_rig("rig-demo", {"recording.codec": "auto", "recording.directory": str(tmp_path)})
+    with pytest.raises(AcquireError, match="cannot be measured") as refused:
+        choose_for(rig)
+    assert type(refused.value) is kind
+    assert "another [recording] directory" in refused.value.hint
+    assert "not measured" in str(Proof(rig)(force=False).warning)
 
 
 @pytest.mark.parametrize(

@@ -23,6 +23,7 @@ from acquire.daemon.uploads import Uploads, check_upload
 from acquire.errors import ConfigError, UsageError
 from acquire.lines import ARMS, LineBlock
 from acquire.store import Continuation, RecordingWriter, RunCondition, mirror, open_recording, recover
+from acquire.store.files import Disk, tree_bytes
 from acquire.store.mirroring import only_copy
 from acquire.stream.tagger import Tagger
 
@@ -296,19 +297,40 @@ def test_without_a_target_recordings_are_not_remembered(tmp_path: Path) -> None:
 def test_copies_on_the_recordings_disk_leave_its_reserve_free(
     place: Place, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """They filled it, and with it what recordings had left for their ends."""
-    path, box = place.write("r.zarr"), Box()
-    free = os.statvfs(path).f_bavail * os.statvfs(path).f_frsize
-    copier = Copier(box, f"file://{place.far}", reserve_bytes=2 * free)
-    copier.add(path, ours=False)
-    copier.turn()
-    assert box.posted[-1].state == "waiting"
-    assert "of which only recording.reserve_gb is free" in box.posted[-1].error
-    assert box.posted[-1].hint == "free space there, or recording.upload_to on another disk"
-    assert not (place.far / "r.zarr" / "a").exists()
+    """They filled it, and a file that was larger than the reserve took all of it."""
+    path, box, reserve = place.here / "r.zarr", Box(), 100
+    with RecordingWriter.create(path, SPEC) as writer:
+        fill(writer, 8 * SHARD_LINES)
+        writer.seal(RunCondition.GOOD, "done", {})
+
+    copier = Copier(box, f"file://{place.far}", reserve)
+    whole = tree_bytes(path)
+    for room in (reserve, reserve + whole // 8, reserve + whole // 2):
+        monkeypatch.setattr(Disk, "free_bytes", lambda *_, room=room: room - tree_bytes(place.far))
+        copier.add(path, ours=False)
+        copier.turn()
+        while box.posted[-1].state == "copying":
+            copier.turn()
+        found = box.posted.pop()
+        assert "bytes more would leave less than recording.reserve_gb free" in found.error
+        assert found.hint == "free space there, or recording.upload_to on another disk"
+        assert room - tree_bytes(place.far) >= reserve
+    assert tree_bytes(place.far) > whole // 8
     # Another disk has a reserve of its own.
     monkeypatch.setattr("acquire.daemon.copier.shares_disk", lambda *_: False)
     copier.add(path, ours=False)
     while box.posted[-1].state != "copied":
         copier.turn()
     assert state_of(place.far / "r.zarr") == "sealed"
+
+
+def test_a_reserve_that_is_reloaded_holds_for_copies_at_once(place: Place) -> None:
+    """It held from the next start on, while the page said otherwise."""
+    path = place.write("r.zarr")
+    free = os.statvfs(path).f_bavail * os.statvfs(path).f_frsize
+    uploads = place.daemon()
+    uploads.keep(2 * free)
+    uploads.add(path)
+    look_until(uploads, lambda: "recording.reserve_gb" in uploads.statuses[-1].error)
+    uploads.keep(0)
+    look_until(uploads, lambda: uploads.statuses[-1].state == "copied")

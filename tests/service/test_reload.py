@@ -63,7 +63,10 @@ def test_allowed_changes_take_effect_and_the_recording_continues(daemon: Daemon,
         )
         answer = daemon("reload")
         assert answer.code == 0, answer.err
-        assert "recording.reserve_gb = 0.5 from the next recording on; it was 0.25" in answer.out
+        assert (
+            "recording.reserve_gb = 0.5 from the next recording on, and for copies at once; it was 0.25"
+            in answer.out
+        )
         assert "hooks.on = ['fault', 'verdict'] at once; it was ['fault', 'loss', 'disk']" in answer.out
         assert client.setup().changed["recording.reserve_gb"] == 0.5
         until(lambda: (disk := client.status().disk) is not None and disk.reserve_bytes == 500_000_000)

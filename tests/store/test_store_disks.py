@@ -20,6 +20,7 @@ from waiting import until
 from acquire.errors import DataError, StoreError, UsageError
 from acquire.lines import ARMS
 from acquire.store import (
+    Circumstances,
     RecordingWriter,
     RunCondition,
     choose_codec,
@@ -27,14 +28,17 @@ from acquire.store import (
     hold,
     measure_disk,
     open_recording,
+    open_video,
     recover,
     verify,
+    write_video,
 )
 from acquire.store.array_writer import ArrayWriter
 from acquire.store.delivery import whole_file
 from acquire.store.files import Disk, ShardFile, write_all
 from acquire.store.pages import PAGE, aligned_bytes, is_aligned, open_direct
 from acquire.store.shape import CODECS
+from acquire.store.table import EVENT_ROWS, GAP_ROWS
 
 BIG = make_spec(pixels=1024, chunk_lines=64, shard_chunks=4, codec="none")
 """Chunks of 128 KiB: large enough for direct I/O."""
@@ -100,6 +104,40 @@ def test_on_a_full_disk_a_hold_leaves_nothing_and_a_recovery_has_its_reserve(sma
 
 
 @pytest.mark.needs_mount
+@pytest.mark.parametrize("text", ["the valve opens " * 25, "\N{BUG}" * 400])
+@pytest.mark.parametrize("killed", [False, True])
+def test_however_many_marks_there_are_the_end_finds_room_on_a_full_disk(small_disk, text, killed):
+    """Their table had outgrown what is reserved for the end: the recording stayed open."""
+    path, texts = small_disk / "r.zarr", [f"{number} {text}" for number in range(EVENT_ROWS)]
+    with RecordingWriter.create(path, make_spec()) as writer:
+        fill(writer, 150)
+        for number in range(200):
+            writer.add_event("mark", number, 1000, texts[number])
+        writer.commit()
+        with contextlib.suppress(OSError), (small_disk / "rest").open("wb", buffering=0) as rest:
+            while rest.write(bytes(4096)):
+                pass
+        for number in range(200, EVENT_ROWS):
+            writer.add_event("mark", number, 1000, texts[number])
+        for _ in range(GAP_ROWS + 3):
+            writer.add_gap("a", 1020, 1, "camera")
+        with pytest.raises(DataError, match="No space left on device"):
+            writer.commit()
+        lines = writer.committed_lines
+        if not killed:
+            writer.seal(RunCondition.ABORTED, "disk full", {})
+    if killed:
+        recover(path, known=Circumstances(notes=tuple((1000, "mark", text) for text in texts)))
+    found = open_recording(path)
+    assert (found.state, found.lines) == ("sealed", lines)
+    listed = [event.text for event in found.events if event.kind == "mark"]
+    assert 600 < len(listed) < EVENT_ROWS
+    assert listed == texts[: len(listed)]
+    assert found.events_not_listed == EVENT_ROWS - len(listed)
+    assert "of the last events found no room in the table" in found.info()["tables_lack"][0]
+
+
+@pytest.mark.needs_mount
 def test_the_watch_ends_a_recording_before_the_disk_is_full(small_disk, monkeypatch):
     monkeypatch.setattr("acquire.store.room.LOOK_S", 0.0)
     path = small_disk / "r.zarr"
@@ -113,6 +151,31 @@ def test_the_watch_ends_a_recording_before_the_disk_is_full(small_disk, monkeypa
     assert "disk nearly full" in recording.attrs["end_reason"]
     assert recording.attrs["ledger"]["store"]["disk_error"] is None
     assert verify(path).intact
+
+
+@pytest.mark.parametrize("fsync", ["seal", "commit"])
+def test_the_directory_of_recordings_may_be_a_link(tmp_path, fsync):
+    """As /data often is: its recordings could not be sealed."""
+    (tmp_path / "mounted").mkdir()
+    (tmp_path / "data").symlink_to("mounted")
+    path, left = tmp_path / "data" / "r.zarr", tmp_path / "data" / "left.zarr"
+    with RecordingWriter.create(path, make_spec(fsync=fsync)) as writer:
+        fill(writer, 150)
+        writer.seal(RunCondition.GOOD, "done", {})
+    with RecordingWriter.create(left, make_spec(fsync=fsync)) as writer:
+        fill(writer, 150)
+        writer.commit()
+    recover(left)
+    for one in (path, left):
+        assert open_recording(one).state == "sealed"
+        assert verify(one).intact
+    place = tmp_path / "data" / "v.zarr"
+    video = np.zeros((4, 6, 6), np.float32)
+    write_video(place, video, np.arange(4), pixel_size=1.0, frame_interval_ns=1.0, provenance={})
+    assert len(open_video(place).time_ns) == 4
+    with whole_file(tmp_path / "data" / "file") as file:
+        file.write_bytes(b"whole")
+    assert (tmp_path / "mounted" / "file").read_bytes() == b"whole"
 
 
 def test_chunks_go_past_the_page_cache_where_that_can_be(path):

@@ -9,11 +9,12 @@ import pytest
 import zarr
 from store_helpers import Truth, fill, make_spec
 
-from acquire.errors import DataError, UsageError
+from acquire.errors import DataError, PlaceError, UsageError
 from acquire.store import RecordingWriter, Retention, RunCondition, hold, open_recording, recover, verify
 from acquire.store.files import Disk
 from acquire.store.removal import COPY, shard_files
-from acquire.store.retention import Keeper, shard_bytes
+from acquire.store.retention import Keeper, keep_from, shard_bytes
+from acquire.store.room import RoomWatch
 
 SHARD = 64
 """Lines: 4 chunks of 16."""
@@ -190,6 +191,47 @@ def test_a_disk_is_reported_as_nearly_full_before_it_is_full(path, always_lookin
         assert writer.room.seconds_to_full == 0
         writer.seal(RunCondition.INTERRUPTED, writer.nearly_full, {})
     assert verify(path).intact
+
+
+class AnyDisk(Disk):
+    """As many bytes as the test says."""
+
+    def __init__(self, free):
+        self.free = free
+
+    def free_bytes(self, path):
+        return self.free
+
+
+@pytest.mark.parametrize("others", [0, 600])
+def test_a_reserve_that_is_smaller_than_one_step_holds(path, always_looking, others):
+    """What came between two looks took all of it, also if another recording on the same disk wrote it."""
+    disk, reserve, written = AnyDisk(10_000), 50, 0
+    watch = RoomWatch(disk, path, reserve)
+    while not watch.look(written).full:
+        written += 400
+        disk.free -= 400 + others
+    assert reserve < disk.free <= reserve + 400 + others
+
+
+def test_a_copy_holds_nothing_where_a_recording_was_moved_away(path, tmp_path):
+    """It made directories there, which looked like a recording that had lost its lines."""
+    with RecordingWriter.create(path, spec_of(None)) as writer:
+        grow(writer, SHARD)
+        path.rename(tmp_path / "moved.zarr")
+        with pytest.raises(PlaceError, match="cannot be held: No such file or directory"):
+            keep_from(path, 1000, "file:///far/r.zarr")
+    assert not path.exists()
+
+
+def test_of_an_endless_recording_on_a_full_disk_what_it_writes_counts(path, always_looking):
+    """It frees as much, so that the disk does not get any fuller."""
+    disk = AnyDisk(50 + 401)
+    watch = RoomWatch(disk, path, 50)
+    assert not watch.look(400).full
+    assert not watch.look(800).full
+    disk.free -= 1
+    assert watch.look(1200).missing_bytes == 0
 
 
 def test_with_retention_the_oldest_lines_make_room_instead(path, always_looking):

@@ -144,7 +144,7 @@ def test_the_commands_say_what_was_lost_of_a_table(tmp_path: Path) -> None:
     cut_short(path / "events" / "text" / "c" / "0")
     for command, said in (
         ("recover", "lost of a table: table events/text cannot be read"),
-        ("info", "lost of tables table events/text cannot be read"),
+        ("info", "incomplete marks and other events, or their texts, have been incomplete since"),
         ("verify", "note: lost of a table when it was recovered"),
     ):
         result = CliRunner().invoke(app, [command, str(path)])

@@ -40,6 +40,7 @@ class MemoryWriter:
     kept_lines: int = 0
     nearly_full: str | None = None
     beyond_bytes: int = 0
+    events_not_listed: int = 0
     packs: bool = False
 
     def append(self, block: TaggedBlock, *, lent: bool = False) -> None:

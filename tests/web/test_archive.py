@@ -29,6 +29,7 @@ from acquire.store import (
     RecordingWriter,
     RunCondition,
     open_recording,
+    open_video,
     opening,
     video,
     write_video,
@@ -235,7 +236,31 @@ def test_a_video_of_which_nothing_was_written_is_black(tmp_path: Path) -> None:
     write_video(path, frames, np.arange(4), pixel_size=1.0, frame_interval_ns=1.0, provenance={})
     found = Archive(tmp_path).video(path.name)
     assert (found.low, found.high) == (0.0, 1.0)
-    assert Archive(tmp_path).frames(path.name, 0, 4) == bytes(frames.size)
+    assert Archive(tmp_path).frames(path.name, 0, 4) == (bytes(frames.size), [])
+
+
+def test_frames_that_are_there_are_shown_and_the_others_named(tmp_path: Path) -> None:
+    """One file that was missing refused the whole video."""
+    path, frames = tmp_path / "film.zarr", np.random.default_rng(1).random((60, 256, 256), np.float32)
+    write_video(path, frames, np.arange(60), pixel_size=1.0, frame_interval_ns=1.0, provenance={})
+    whole, lost = Archive(tmp_path).frames(path.name, 0, 60)
+    assert lost == []
+    size = open_video(path).video.chunks[0]
+    assert 2 * size < 60
+    (path / "0" / "c" / "1" / "0" / "0").unlink()
+    damaged = path / "0" / "c" / "0" / "0" / "0"
+    os.truncate(damaged, damaged.stat().st_size // 2)
+    archive = Archive(tmp_path)
+    assert archive.video(path.name).missing == [(size, 2 * size)]
+    shown, lost = archive.frames(path.name, 0, 60)
+    assert lost == [range(2 * size)]
+    end = 2 * size * 256**2
+    assert shown[:end] == bytes(end)
+    # Black and white follow from the frames that are there.
+    late = [np.frombuffer(one, np.uint8)[end:].astype(int) for one in (shown, whole)]
+    assert np.abs(late[0] - late[1]).max() < 10
+    with pytest.raises(DataError, match="is missing"):
+        archive.frames(path.name, size, size)
 
 
 def test_lists_read_what_has_changed_and_remember_what_is_listed(

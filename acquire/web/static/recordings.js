@@ -39,7 +39,7 @@ export class Recordings {
       return make("li", {}, make("button", { id: `recording-${one.name}`, "aria-pressed": String(one.name === this.#chosen), onclick: () => this.#choose(one.name) },
         make("img", { src: one.error ? "" : `/api/recordings/${encodeURIComponent(one.name)}/picture?${one.lines}`, alt: "", loading: "lazy" }),
         make("span", {}, make("b", {}, one.name),
-          make("small", { className: one.error || one.damage || lost || one.tainted_by.length ? "bad" : "" }, `${state}${lost ? `, ${count(lost)} lines lost` : ""}${one.held ? ", held" : ""}`),
+          make("small", { className: one.error || one.damage || lost || one.tainted_by.length || one.incomplete.length ? "bad" : "" }, `${state}${lost ? `, ${count(lost)} lines lost` : ""}${one.incomplete.length ? ", its lists are incomplete" : ""}${one.held ? ", held" : ""}`),
           make("small", {}, one.error ?? `${count(one.lines)} lines, ${duration(one.duration_s)}, ${quantity(one.bytes, "B")}`),
           make("small", {}, [one.start_ns ? day(one.start_ns) : "", one.uploaded ? `copied to ${one.uploaded}` : ""].filter(Boolean).join("; ")))));
     }), ...more] : [make("li", {}, "No recordings yet.")]);
@@ -66,7 +66,7 @@ export class Recordings {
     const strip = this.#strip(one, first, lines);
     const job = (kind) => () => this.#job({ kind, recording: one.name, first_line: Number(first.value), lines: Number(lines.value), spatial_merge: Number(side.value), temporal_merge: Number(time.value), preset: preset.value });
     $("detail").replaceChildren(make("h2", {}, one.name), make("dl", {},
-      ...[["Lines", `${count(one.lines)}, from ${count(one.first_line)} on, at ${quantity(one.line_rate_hz, "lines/s")}`], ["Condition", `${one.condition ?? one.state}${one.end_reason ? `, ${one.end_reason}` : ""}`], ["Lost", one.lost_lines === null ? "unknown" : Object.entries(one.lost_lines).map(([arm, n]) => `${arm.toUpperCase()} ${count(n)}`).join(", ")], ["Tainted by", one.tainted_by.join("; ") || "nothing"], ["Damage", one.damage ?? "none that shows"]]
+      ...[["Lines", `${count(one.lines)}, from ${count(one.first_line)} on, at ${quantity(one.line_rate_hz, "lines/s")}`], ["Condition", `${one.condition ?? one.state}${one.end_reason ? `, ${one.end_reason}` : ""}`], ["Lost", one.lost_lines === null ? "unknown" : Object.entries(one.lost_lines).map(([arm, n]) => `${arm.toUpperCase()} ${count(n)}`).join(", ")], ["Tainted by", one.tainted_by.join("; ") || "nothing"], ["Damage", one.damage ?? "none that shows"], ...(one.incomplete.length ? [["Incomplete", one.incomplete.join("; ")]] : [])]
         .flatMap(([term, text]) => [make("dt", {}, term), make("dd", {}, text)])),
       make("p", { className: "hint" }, "Drag over the time line to select a range, or click an event."), strip.element,
       make("ul", { className: "fields", "aria-label": "Events" }, ...one.event_list.slice(-12).map((event) => make("li", {}, make("button", { onclick: () => strip.choose(Math.max(one.first_line, event.line - 128), 256) }, `${event.kind}${event.text ? `: ${event.text}` : ""}`)))),
