@@ -73,9 +73,7 @@ def unit_text(rig: RigConfig, config: Path, *, user: bool, account: str | None =
         f"ExecReload={python} -m acquire reload{listens}",
         *([] if user else [f"User={who}"]),
         *([] if user or not groups else [f"SupplementaryGroups={groups}"]),
-        *([] if user else ["RuntimeDirectory=acquire"]),
-        # The directory of `SOCKET`, which is then the default socket of the daemon.
-        *([] if user else ["RuntimeDirectoryMode=0700", "Environment=XDG_RUNTIME_DIR=/run/acquire"]),
+        *([] if user else _directories()),
         f"WorkingDirectory={_quoted(recordings)}",
         f"WatchdogSec={WATCHDOG_S}",
         "Restart=on-failure",
@@ -111,6 +109,17 @@ def unit_text(rig: RigConfig, config: Path, *, user: bool, account: str | None =
             "",
         ]
     )
+
+
+def _directories() -> list[str]:
+    return [
+        "RuntimeDirectory=acquire",
+        "RuntimeDirectoryMode=0700",
+        # For compiled loops, which every job of the page would compile anew: home and package are read-only.
+        "CacheDirectory=acquire",
+        # The former is the directory of `SOCKET`, which is then the default socket of the daemon.
+        "Environment=XDG_RUNTIME_DIR=/run/acquire NUMBA_CACHE_DIR=/var/cache/acquire",
+    ]
 
 
 def _hardening(recordings: Path, rig: RigConfig) -> list[str]:

@@ -19,6 +19,7 @@ from acquire.evaluate.report import (
     RigFacts,
     evaluate_solver,
 )
+from acquire.loops import how_often
 from acquire.recon import Reconstruction, reconstruct
 from acquire.reconstruct import save_reconstruction
 from acquire.sim.leds import LedScene, LedSceneConfig
@@ -131,9 +132,7 @@ def _solve(method: Method, segment: Segment, journal: Journal) -> Reconstruction
         )
         note["detail"] = f"{result.iterations} iterations"
         if result.compiled_s >= REPORTED_S:
-            note["detail"] += (
-                f", including {result.compiled_s:.1f} s of compilation, needed once per installation"
-            )
+            note["detail"] += f", including {result.compiled_s:.1f} s of compilation, needed {how_often()}"
     return result
 
 
