@@ -12,7 +12,7 @@ from acquire.cli.progress import stage_progress
 from acquire.config.scene import SineDrive
 from acquire.evaluate.host import HostWatch
 from acquire.evaluate.report import (
-    ArmLedger,
+    ArmAccount,
     CaptureFacts,
     DemoResult,
     Region,
@@ -193,7 +193,7 @@ def _capture_facts(recording: Recording, captured: Captured) -> CaptureFacts:
         seconds=captured.seconds,
         size_bytes=int(recording.info()["bytes"]),
         arms={
-            name: ArmLedger(
+            name: ArmAccount(
                 delivered=arm.delivered,
                 preroll=arm.preroll,
                 discarded=arm.discarded,
