@@ -26,9 +26,8 @@ The layers, top to bottom; imports point downwards only (checked by the tests)::
     alignment  blur                  position and sharpness of the arms' images
     converter  noise                 a camera's non-linearity and noise
     arrays cores  loops   reading    array back ends · cores · compiled loops · safe reading of foreign files
-    logs   plugins  showing          one line per entry · classes that entry points name · reprs
+    logs   plugins  showing scratch  log entries · classes of entry points · reprs · a run's directory
     errors text   lazy   place       errors with exit codes · foreign text · late imports · fixed paths
-    scratch                          a directory for libraries without a home
 
 `GLOSSARY.md`, next to this file, defines the terms; `DECISIONS.md` gives the reasons for the design and the
 alternatives that were considered.

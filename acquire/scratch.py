@@ -9,6 +9,8 @@ import tempfile
 from functools import cache
 from pathlib import Path
 
+from acquire.place import home
+
 PREFIX = "acquire-scratch-"
 
 
@@ -29,12 +31,12 @@ def prepare_matplotlib() -> None:
 
 def _has_place_for_matplotlib() -> bool:
     """Whether this user can write, or make, the directories that matplotlib chooses."""
+    places = [
+        Path(os.environ.get(variable) or home() / usual) / "matplotlib"
+        for variable, usual in (("XDG_CONFIG_HOME", ".config"), ("XDG_CACHE_HOME", ".cache"))
+    ]
     try:
-        places = [
-            Path(os.environ.get(variable) or Path.home() / usual) / "matplotlib"
-            for variable, usual in (("XDG_CONFIG_HOME", ".config"), ("XDG_CACHE_HOME", ".cache"))
-        ]
         there = [next(each for each in (place, *place.parents) if each.exists()) for place in places]
-    except (RuntimeError, OSError):  # this user has no home, or may not look at it
+    except OSError:  # this user may not look at it
         return False
     return all(os.access(each, os.W_OK | os.X_OK) for each in there)

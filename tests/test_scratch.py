@@ -3,9 +3,16 @@
 from __future__ import annotations
 
 import os
+import pwd
 import subprocess
 import sys
 from pathlib import Path
+
+import pytest
+
+from acquire.config import load_rig
+from acquire.daemon.unit import unit_text
+from acquire.reconstruct.learned import learned_path, recall
 
 COMPILE = """
 import pathlib, subprocess, sys
@@ -78,3 +85,16 @@ def test_matplotlib_keeps_its_files_in_a_home_that_takes_them(tmp_path: Path) ->
     done = run(DRAW, tmp_path, HOME=str(home))
     assert (done.stdout.strip(), done.stderr) == ("its own", "")
     assert (home / ".config" / "matplotlib").is_dir()
+
+
+def test_a_user_who_is_in_no_list_of_accounts_has_no_home(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As in a container; it was a RuntimeError of pathlib's."""
+    monkeypatch.delenv("HOME", raising=False)
+    monkeypatch.delenv("XDG_CACHE_HOME", raising=False)
+    monkeypatch.setattr(pwd, "getpwuid", {}.__getitem__)  # which raises KeyError, as for such a user
+    assert not learned_path().exists()
+    assert recall() == []
+    unit = unit_text(load_rig("rig-demo"), tmp_path / "rig.toml", user=False)
+    assert f"User={os.geteuid()}\n" in unit

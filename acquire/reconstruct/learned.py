@@ -18,6 +18,8 @@ from typing import TYPE_CHECKING
 
 from pydantic import TypeAdapter
 
+from acquire.place import home
+
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
 
@@ -50,7 +52,7 @@ class PresetChoice:
 
 def learned_path() -> Path:
     """Return ``$XDG_CACHE_HOME/acquire/tradeoff.json``, or the same under ``~/.cache``."""
-    cache = os.environ.get("XDG_CACHE_HOME") or str(Path.home() / ".cache")
+    cache = os.environ.get("XDG_CACHE_HOME") or str(home() / ".cache")
     return Path(cache) / "acquire" / "tradeoff.json"
 
 
