@@ -25,8 +25,8 @@ The layers, top to bottom; imports point downwards only (checked by the tests)::
     codes  geometry  clock  flags    the code, the shear, the time: plain arithmetic · flags of lines
     alignment  blur                  position and sharpness of the arms' images
     converter  noise                 a camera's non-linearity and noise
-    arrays cores  reading            array back ends · cores they may use · safe reading of foreign files
-    logs   plugins  showing          one line per entry · classes that entry points name · reprs
+    arrays cores  loops   reading    array back ends · cores · compiled loops · safe reading of foreign files
+    logs   plugins  showing scratch  log entries · classes of entry points · reprs · a run's directory
     errors text   lazy   place       errors with exit codes · foreign text · late imports · fixed paths
 
 `GLOSSARY.md`, next to this file, defines the terms; `DECISIONS.md` gives the reasons for the design and the

@@ -9,6 +9,14 @@ import os
 from pathlib import Path
 
 
+def home() -> Path:
+    """Return this user's home directory; one that does not exist for an account that has none."""
+    try:
+        return Path.home()
+    except RuntimeError:  # as of a container's user, who is in no list of accounts
+        return Path("/nonexistent")
+
+
 def default_socket() -> Path:
     """Return the default control socket: in the user's runtime directory, else in one in /tmp."""
     runtime = os.environ.get("XDG_RUNTIME_DIR") or f"/tmp/acquire-{os.geteuid()}"  # noqa: S108

@@ -41,7 +41,7 @@ if TYPE_CHECKING:
 
     from acquire.codes import Code
     from acquire.config.scene import SceneConfig
-    from acquire.sim.pipeline import Camera
+    from acquire.sim.pipeline import ArmSource
     from acquire.sim.readout import Readout
 
     _Block = tuple[int, dict[str, Future[Readout]]]
@@ -231,7 +231,7 @@ def _write(
 
 
 def _read_ahead(
-    cameras: dict[str, Camera], threads: dict[str, ThreadPoolExecutor], lines: int
+    cameras: dict[str, ArmSource], threads: dict[str, ThreadPoolExecutor], lines: int
 ) -> Iterator[_Block]:
     """Yield first line and readouts of each block; the next is computed while the caller handles this one."""
     waiting: deque[_Block] = deque()

@@ -26,7 +26,7 @@ from acquire.config import load_rig, load_scene
 from acquire.config.scene import SceneFile
 from acquire.recon.segments import Voxels
 from acquire.reconstruct import Options, Watcher, by_lines, combine, in_tiles, in_voxels, open_pool
-from acquire.sim.procedural import Stage, still
+from acquire.sim.procedural import Canvas, still
 from acquire.sim.scene import frames_at
 from acquire.sim.scenes import build_scene
 from acquire.simulate import bench_of, simulate
@@ -42,11 +42,11 @@ BLOCK = 16
 
 def still_scene(home: Path, seed: int) -> dict[str, object]:
     """A picture twice as wide as high: coarse texture on the left, fine on the right."""
-    coarse = still(Stage(1536, 2, seed))(0, 0.0)[:768, :768]
+    coarse = still(Canvas(1536, 2, seed))(0, 0.0)[:768, :768]
     fine = np.empty((768, 768), np.float32)
     for number in range(9):
         i, j = divmod(number, 3)
-        fine[256 * i : 256 * i + 256, 256 * j : 256 * j + 256] = still(Stage(256, 2, 100 * seed + number))(
+        fine[256 * i : 256 * i + 256, 256 * j : 256 * j + 256] = still(Canvas(256, 2, 100 * seed + number))(
             0, 0.0
         )
     picture = np.rint(255 * np.clip(np.hstack([coarse, fine]), 0, 1)).astype(np.uint8)

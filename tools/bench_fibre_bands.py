@@ -28,7 +28,7 @@ from acquire.calibrate.target import tile_alignments
 from acquire.config import load_rig
 from acquire.config.scene import SceneFile
 from acquire.recon import reconstruct
-from acquire.sim.procedural import Stage, still
+from acquire.sim.procedural import Canvas, still
 from acquire.simulate import simulate
 
 ROWS, COLUMNS, STAGES, LINES, SHOWN, RIM = 128, 192, 64, 1024, 300, 6
@@ -49,7 +49,7 @@ def main() -> None:
 
 def measured(home: Path, seed: int, pixels: float) -> dict[str, object]:
     """Measure with this deviation of the bands: uncorrected and aligned."""
-    picture = np.clip(still(Stage(COLUMNS, 2, seed))(0, 0.0)[:ROWS], 0, 1)
+    picture = np.clip(still(Canvas(COLUMNS, 2, seed))(0, 0.0)[:ROWS], 0, 1)
     Image.fromarray(np.rint(255 * picture).astype(np.uint8)).save(home / "still.png")
     light = STAGES * 0.5 * 0.6  # for a mostly white texture that is lit half of the time
     camera = {"responsivity_dn": TOP_DN / light / 1.6, "dn_per_electron": K, "read_noise_e": 10.0}

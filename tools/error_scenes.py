@@ -28,7 +28,7 @@ from acquire.codes import mix_seed, prbs
 from acquire.config import load_scene
 from acquire.forward import DualArm
 from acquire.geometry import Geometry
-from acquire.sim.procedural import SUBSTEP_HZ, Camera, Recorded, Stage, expose
+from acquire.sim.procedural import SUBSTEP_HZ, Camera, Canvas, Recorded, expose
 from acquire.sim.scenes import build_scene
 from acquire.sim.voxels import truth
 
@@ -44,7 +44,7 @@ PHOTOGRAPHS = ("astronaut", "brick", "camera", "cat", "coffee", "coins", "moon",
 FIRST_SUBSTEP = 600
 
 
-def _photograph(s: Stage, share: float = 1.0) -> NDArray[np.float32]:
+def _photograph(s: Canvas, share: float = 1.0) -> NDArray[np.float32]:
     """A random grey crop of one of them, new at each call; its side in units of the picture's."""
     whole = getattr(data, str(s.rng.choice(PHOTOGRAPHS)))().astype(np.float64)
     grey = whole.mean(2) if whole.ndim == 3 else whole
@@ -65,18 +65,18 @@ def _seen(
     return np.asarray(found, np.float32)
 
 
-def pan(s: Stage) -> Frame:
+def pan(s: Canvas) -> Frame:
     photo, angle, far = _photograph(s, 1.6), s.rng.uniform(0, 2 * np.pi), s.rng.uniform(0.1, 0.3)
     way = far * s.n * np.array([np.sin(angle), np.cos(angle)])
     return lambda _t, tau: _seen(photo, s.n, np.eye(2), (tau - 0.5) * way)
 
 
-def zoom(s: Stage) -> Frame:
+def zoom(s: Canvas) -> Frame:
     photo, most = _photograph(s, 1.5), s.rng.uniform(0.1, 0.35)
     return lambda _t, tau: _seen(photo, s.n, (1 - most * tau) * np.eye(2), np.zeros(2))
 
 
-def turn(s: Stage) -> Frame:
+def turn(s: Canvas) -> Frame:
     photo, most = _photograph(s, 1.5), s.rng.uniform(0.2, 0.7)
 
     def frame(_t: int, tau: float) -> NDArray[np.float32]:
@@ -86,7 +86,7 @@ def turn(s: Stage) -> Frame:
     return frame
 
 
-def curtain(s: Stage) -> Frame:
+def curtain(s: Canvas) -> Frame:
     photos, slope = [_photograph(s), _photograph(s)], s.rng.uniform(-0.3, 0.3)
 
     def frame(_t: int, tau: float) -> NDArray[np.float32]:
@@ -96,12 +96,12 @@ def curtain(s: Stage) -> Frame:
     return frame
 
 
-def dissolve(s: Stage) -> Frame:
+def dissolve(s: Canvas) -> Frame:
     photos = [_photograph(s), _photograph(s)]
     return lambda _t, tau: np.asarray((1 - tau) * photos[0] + tau * photos[1], np.float32)
 
 
-def lamps(s: Stage) -> Frame:
+def lamps(s: Canvas) -> Frame:
     photos, left = [_photograph(s), _photograph(s)], s.inside(s.x - 0.5)
     rest = np.float32(s.rng.uniform(0.1, 0.4))
 
@@ -112,7 +112,7 @@ def lamps(s: Stage) -> Frame:
     return frame
 
 
-def rain(s: Stage) -> Frame:
+def rain(s: Canvas) -> Frame:
     ground, drops = 0.3 * _photograph(s), s.rng.uniform([0, 0, 0.7], [1, 1, 1.6], (14, 3))
 
     def frame(_t: int, tau: float) -> NDArray[np.float32]:
@@ -125,7 +125,7 @@ def rain(s: Stage) -> Frame:
     return frame
 
 
-def bubbles(s: Stage) -> Frame:
+def bubbles(s: Canvas) -> Frame:
     found = s.rng.uniform([0.1, 0.4, 0.03, 0.2], [0.9, 1.3, 0.09, 0.7], (9, 4))
     phases = s.rng.uniform(0, 6, 9)
 
@@ -139,7 +139,7 @@ def bubbles(s: Stage) -> Frame:
     return frame
 
 
-def swing(s: Stage) -> Frame:
+def swing(s: Canvas) -> Frame:
     photo, far, turns = _photograph(s), s.rng.uniform(0.3, 0.8), s.rng.uniform(0.5, 1.2)
 
     def frame(_t: int, tau: float) -> NDArray[np.float32]:
@@ -149,7 +149,7 @@ def swing(s: Stage) -> Frame:
     return frame
 
 
-def fan(s: Stage) -> Frame:
+def fan(s: Canvas) -> Frame:
     photo, turns = _photograph(s), s.rng.uniform(0.2, 0.5)
     angle, far = np.arctan2(s.y - 0.5, s.x - 0.5), np.hypot(s.y - 0.5, s.x - 0.5)
 
@@ -160,7 +160,7 @@ def fan(s: Stage) -> Frame:
     return frame
 
 
-def ripples(s: Stage) -> Frame:
+def ripples(s: Canvas) -> Frame:
     (ys, xs), periods = s.rng.uniform(0.2, 0.8, (2, 2)), s.rng.uniform(1.5, 4, 2)
     far = [np.hypot(s.y - y, s.x - x) for y, x in zip(ys, xs, strict=True)]
 
@@ -171,7 +171,7 @@ def ripples(s: Stage) -> Frame:
     return frame
 
 
-def smoke(s: Stage) -> Frame:
+def smoke(s: Canvas) -> Frame:
     layers, photo = [s.texture(0.03, 0.1, 0.2) for _ in range(2)], _photograph(s)
     ways = s.rng.uniform(-0.4, 0.4, (2, 2))
 
@@ -186,7 +186,7 @@ def smoke(s: Stage) -> Frame:
     return frame
 
 
-def typing(s: Stage) -> Frame:
+def typing(s: Canvas) -> Frame:
     ground, keys = 0.25 * _photograph(s), s.rng.random((5, 6))
     cells = [(s.box(0.15 + 0.16 * r, 0.12 + 0.15 * c, 0.1, 0.09), keys[r, c]) for r, c in np.ndindex(5, 6)]
 
@@ -199,7 +199,7 @@ def typing(s: Stage) -> Frame:
     return frame
 
 
-def pulse(s: Stage) -> Frame:
+def pulse(s: Canvas) -> Frame:
     photo, (y, x), times = _photograph(s), s.rng.uniform(0.3, 0.7, 2), s.rng.uniform(3, 8)
     spot = np.exp(-(np.square(s.y - y) + np.square(s.x - x)) / 0.05)
 
@@ -211,7 +211,7 @@ def pulse(s: Stage) -> Frame:
     return frame
 
 
-def shadow(s: Stage) -> Frame:
+def shadow(s: Canvas) -> Frame:
     photo, angle = _photograph(s), s.rng.uniform(0, 2 * np.pi)
     along = (s.x - 0.5) * np.cos(angle) + (s.y - 0.5) * np.sin(angle)
     return lambda _t, tau: np.asarray(
@@ -219,7 +219,7 @@ def shadow(s: Stage) -> Frame:
     )
 
 
-def flashes(s: Stage) -> Frame:
+def flashes(s: Canvas) -> Frame:
     ground, found = 0.4 * _photograph(s), s.rng.uniform([0.1, 0.1, 0.1, 0.02], [0.9, 0.9, 0.9, 0.08], (8, 4))
 
     def frame(_t: int, tau: float) -> NDArray[np.float32]:
@@ -245,7 +245,7 @@ def record(name: str, seed: int, *, stages: int, substeps: int, lines: int, came
         light = truth(scene, FIRST_SUBSTEP * seed, geometry.span, 1, 1)
     else:
         drawn = 1000 * seed + [*SCENES, *KEPT].index(name)  # otherwise all would show the same photograph
-        frame = (OF_OUR_OWN | KEPT)[name](Stage(geometry.size, geometry.span, drawn))
+        frame = (OF_OUR_OWN | KEPT)[name](Canvas(geometry.size, geometry.span, drawn))
         light = np.stack([frame(t, t / (geometry.span - 1)) for t in range(geometry.span)])
     light = np.asarray(light, np.float32)
     exact = DualArm(geometry, code).forward(light).astype(np.float64)

@@ -198,7 +198,7 @@ def _origin(run: Run) -> str:
     on = run.machine
     cut = "" if run.whole else "; cut short"
     return (
-        f"(`{run.command}`, {run.date[:10]}, commit {run.commit}; {on.cpu}, {on.cores} cores, "
+        f"(`{run.command}`,\n{run.date[:10]}, commit {run.commit}; {on.cpu}, {on.cores} cores, "
         f"load {on.load_before:g} before; Python {on.python}, NumPy {on.numpy}{cut})"
     )
 

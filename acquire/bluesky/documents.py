@@ -48,7 +48,7 @@ def data_keys(name: str, rig: RigConfig) -> dict[str, DataKey]:
 
 
 @dataclass(slots=True)
-class Segment:
+class RecordedRows:
     """One recording on disk: rows that are readable in both arms, and rows that documents cover."""
 
     path: Path
@@ -67,10 +67,10 @@ class Account:
     def __init__(self, name: str, rig: RigConfig, path: Path, budget: int | None) -> None:
         self._name, self._rig = name, rig
         self.budget = budget
-        self.segments = [Segment(path)]
+        self.segments = [RecordedRows(path)]
 
     @property
-    def now(self) -> Segment:
+    def now(self) -> RecordedRows:
         return self.segments[-1]
 
     @property
@@ -80,7 +80,7 @@ class Account:
         return self.now.lines + (0 if first is None or last is None else last - first)
 
     @property
-    def uncovered(self) -> list[Segment]:
+    def uncovered(self) -> list[RecordedRows]:
         """Segments with lines that no document covers yet."""
         return [segment for segment in self.segments if segment.covered < segment.lines]
 

@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Any
 from bluesky.protocols import Collectable, Flyable, Movable, Preparable, Stageable, WritesStreamAssets
 from ophyd_async.core import DEFAULT_TIMEOUT, AsyncStatus, Device, WatchableAsyncStatus, WatcherUpdate
 
-from acquire.bluesky.documents import Account, Segment, data_keys
+from acquire.bluesky.documents import Account, RecordedRows, data_keys
 from acquire.client import SEALED, AsyncClient, State, Status, core
 from acquire.config import RigConfig
 from acquire.daemon.messages import StartRequest, fault_error
@@ -350,4 +350,4 @@ def _add_segment(account: Account, path: Path) -> None:
         return
     # A recording recovered after its recorder was killed may contain lines that the next segment has, too.
     account.now.lines = min(current.lines, next_segment.first_line - current.first_line)
-    account.segments.append(Segment(path, next_segment.first_line))
+    account.segments.append(RecordedRows(path, next_segment.first_line))

@@ -42,7 +42,7 @@ APART = 4.0
 
 
 @dataclass(frozen=True, slots=True)
-class Setting:
+class DelayRange:
     """The possible delays of one trigger, in ticks."""
 
     clock_hz: int
@@ -92,7 +92,7 @@ class Setting:
 
 
 @dataclass(frozen=True, slots=True)
-class Point:
+class SweepPoint:
     """One recording of a sweep: the ticks by which each arm's lines were delayed, and their contributions."""
 
     later: tuple[int, int]
@@ -112,15 +112,15 @@ class Crossing:
     edge_ticks: float
 
 
-def setting_of(exposure: Exposure) -> Setting:
+def setting_of(exposure: Exposure) -> DelayRange:
     config = exposure.recording.attrs["config"]
     trigger = config["trigger"]
     each = 1 if trigger["line_start"] == "per-substep" else config["geometry"]["substeps"]
     ticks = trigger["substep_ticks"]
-    return Setting(trigger["clock_hz"], ticks, ticks * each)
+    return DelayRange(trigger["clock_hz"], ticks, ticks * each)
 
 
-def point_of(exposure: Exposure) -> Point:
+def point_of(exposure: Exposure) -> SweepPoint:
     """Evaluate a recording of a sweep, together with the delays that it was made with."""
     trigger = exposure.recording.attrs["config"]["trigger"]
     lead, a, b = (
@@ -128,10 +128,10 @@ def point_of(exposure: Exposure) -> Point:
         trigger["a"]["delay_ticks"],
         trigger["b"]["delay_ticks"],
     )
-    return Point((lead + a, lead + b), beyond(exposure))
+    return SweepPoint((lead + a, lead + b), beyond(exposure))
 
 
-def first_sight(point: Point, substep_ticks: int) -> list[float]:
+def first_sight(point: SweepPoint, substep_ticks: int) -> list[float]:
     """Estimate from one recording the delay of each arm's light, in ticks, without delays of the trigger."""
     return [
         later + each.late_substeps * substep_ticks
@@ -139,7 +139,7 @@ def first_sight(point: Point, substep_ticks: int) -> list[float]:
     ]
 
 
-def lines_for(point: Point, lines: int, substep_ticks: int) -> int:
+def lines_for(point: SweepPoint, lines: int, substep_ticks: int) -> int:
     """Return the lines per recording for a sweep that is certain to half a tick, within sensible limits."""
     error_ticks = max(each.error for each in point.seen) * substep_ticks
     # Errors fall with the root of the number of lines.
@@ -166,7 +166,9 @@ def delay(exposures: Sequence[Exposure], *, progress: Progress = no_progress) ->
     return evaluate_sweep(points, exposures, setting)
 
 
-def evaluate_sweep(points: Sequence[Point], exposures: Sequence[Exposure], setting: Setting) -> Finding:
+def evaluate_sweep(
+    points: Sequence[SweepPoint], exposures: Sequence[Exposure], setting: DelayRange
+) -> Finding:
     """Return the result of a sweep from its points."""
     crossings = [_crossing(points, arm, setting.substep_ticks) for arm in range(len(ARMS))]
     late = np.array([each.late_ticks for each in crossings])
@@ -184,7 +186,7 @@ def evaluate_sweep(points: Sequence[Point], exposures: Sequence[Exposure], setti
     return Finding("delay", exposures[0].instrument, quantities, facts=facts, warnings=_doubts(error, facts))
 
 
-def settings_for(late: NDArray[np.float64], setting: Setting) -> dict[str, int]:
+def settings_for(late: NDArray[np.float64], setting: DelayRange) -> dict[str, int]:
     """Return the keys of ``[trigger]`` that align light and charge of both arms as far as possible."""
     late = late - setting.whole_substeps(late) * setting.substep_ticks
     # light that is early without any delay cannot be delayed; its beginning is cut off (`light.open_ticks`)
@@ -198,7 +200,7 @@ def settings_for(late: NDArray[np.float64], setting: Setting) -> dict[str, int]:
     return keys | ({"light.open_ticks": round(earlier)} if round(earlier) > 0 else {})
 
 
-def _crossing(points: Sequence[Point], arm: int, substep_ticks: int) -> Crossing:
+def _crossing(points: Sequence[SweepPoint], arm: int, substep_ticks: int) -> Crossing:
     """Fit one arm's delay, with which the table in `acquire.calibrate.delay` explains all recordings."""
     # a start only, and for the side of every recording: the edge rows may be darker than the mean row
     sight = float(np.median([first_sight(point, substep_ticks)[arm] for point in points]))

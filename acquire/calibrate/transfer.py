@@ -35,7 +35,7 @@ ROUGHLY = 0.05
 
 
 @dataclass(frozen=True, slots=True)
-class Point:
+class LightLevel:
     """One level of light on one arm: means over its columns, in DN and DN²."""
 
     light: float
@@ -59,7 +59,7 @@ def transfer(
     # a curve stretches noise by its slope
     dark_noise = straightened(known, offset, offset)[1] * known.quantities["noise_dn"].value
     usable = np.ones_like(offset, np.bool_) if known.usable is None else known.usable
-    points: dict[str, list[Point]] = {arm: [] for arm in ARMS}
+    points: dict[str, list[LightLevel]] = {arm: [] for arm in ARMS}
     for exposure in exposures:
         refuse_coded(exposure, "transfer")
         found = moments(exposure, progress)
@@ -70,7 +70,7 @@ def transfer(
             # A variance σ² that was measured with n values has itself a variance of 2σ⁴/n.
             errors = 2 * (own**2 / found.lines[i] + dark**2 / dark_lines)
             points[arm].append(
-                Point(
+                LightLevel(
                     light=float(light[i, good].mean()),
                     variance=float((own - dark).mean()),
                     error=float(np.sqrt(errors.sum()) / good.sum()),
@@ -95,12 +95,12 @@ def transfer(
     return Finding("transfer", exposures[0].instrument, quantities, facts=facts)
 
 
-def _slope(points: list[Point], arm: str) -> tuple[float, float, float]:
+def _slope(points: list[LightLevel], arm: str) -> tuple[float, float, float]:
     """Return K, its standard error, and the light in DN of the last level before pixels are full, or inf.
 
     ``points`` are in the order of rising light.
     """
-    kept: list[Point] = []
+    kept: list[LightLevel] = []
     full_dn = float("inf")
     for point in points:
         fallen = bool(kept) and point.variance < kept[-1].variance - FALLEN * (point.error + kept[-1].error)

@@ -127,7 +127,7 @@ def _deliver(files: dict[Path, str], *, wanted: bool) -> bool:
                 hint="compare the two, and remove the old file first",
             )
     for path, text in files.items():
-        with refused(path, "written"):
+        with refused(path, "written", "sudo for the host's service, or --directory"):
             path.parent.mkdir(parents=True, exist_ok=True)
             path.write_text(text, encoding="utf-8")
         say(f"wrote {path}")

@@ -90,13 +90,10 @@ def paper(
         )
     if budget is not None and not budget > 0:
         raise UsageError(f"a budget of {budget:g} s is out of range", possible="more than 0")
-    import matplotlib as mpl
-
     from acquire.cores import idle_cores, limit_blas
     from acquire.evaluate.paper import Studio, make
     from acquire.evaluate.paper.fig9_recorded import figure_of
     from acquire.evaluate.paper.page import draw, write_page
-    from acquire.evaluate.themed import STYLE
     from acquire.recon.solver import preset_iterations
     from acquire.reconstruct import Options
     from acquire.store import open_recording
@@ -111,11 +108,11 @@ def paper(
             # The name is bound here and now: the loop goes on to the next.
             studio = Studio(out, options, seed, lambda text, name=name: report(f"{name}: {text}"))  # type: ignore[misc]
             with _whole_figure(out):
-                if recording is None:
-                    figure = make(name, studio)
-                else:
-                    with mpl.rc_context(STYLE):
-                        figure = figure_of(open_recording(recording), studio, first_line)
+                figure = (
+                    make(name, studio)
+                    if recording is None
+                    else figure_of(open_recording(recording), studio, first_line)
+                )
                 # Drawn at once, so that only one figure's videos are in memory.
                 made.append(draw(figure, out, studio.host.busyness()))
             # After every figure, so that an interrupted run leaves a page with those it has made.

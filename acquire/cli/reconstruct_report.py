@@ -76,6 +76,7 @@ def print_outcomes(outcomes: list[Outcome], *, json: bool, preview: bool, more: 
 
 
 def _outcome_facts(outcome: Outcome) -> dict[str, Any]:
+    from acquire.loops import how_often
     from acquire.recon import Quality
     from acquire.showing import error_in_words
 
@@ -108,7 +109,7 @@ def _outcome_facts(outcome: Outcome) -> dict[str, Any]:
         "trusted": f"frames {first} to {end - 1}" if end > first else f"none: {reason}",
         "solver": f"{facts['solver']}, {iterated} iterations, {facts['seconds']:.1f} s",
         "corrected": ", ".join(facts["calibration"]["corrected"]) if facts["calibration"] else None,
-        "compiled": f"{facts['compiled_s']:.1f} s of this time, needed once per installation"
+        "compiled": f"{facts['compiled_s']:.1f} s of this time, needed {how_often()}"
         if facts["compiled_s"] >= COMPILED_S
         else None,
         "misfit": f"{quality['misfit']:.2%} of the samples' RMS",

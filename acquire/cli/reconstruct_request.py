@@ -15,7 +15,7 @@ from acquire.cli.stretch import first_ns, lines_between
 from acquire.config import check_plan, load_plan
 from acquire.errors import UsageError
 from acquire.recon.segments import Stretch, Voxels
-from acquire.reconstruct.learned import Choice, choose, recall
+from acquire.reconstruct.learned import PresetChoice, choose, recall
 from acquire.reconstruct.select import (
     Selection,
     along_plan,
@@ -104,9 +104,9 @@ def prepare(recording: Recording, arguments: Arguments) -> Prepared:
     options = prepared.options
     known = [each for each in recall() if each.solver == options.solver]
     if arguments.preset:
-        choice = Choice(arguments.preset, "")
+        choice = PresetChoice(arguments.preset, "")
     elif options.budget_s is None or not known:
-        choice = Choice(None, "")
+        choice = PresetChoice(None, "")
     else:
         grids = [request.grid for request in requests.values()]
         # The whole work has to fit the limit: all videos, and all tiles of each.

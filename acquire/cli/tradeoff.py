@@ -158,7 +158,11 @@ def tradeoff(
         try:
             kept = remember(_lessons(runs))
         except OSError as error:  # the page is there, and may have taken hours
-            print_warning(f"the presets' results are not kept for --budget: {error}")
+            why = f"{error.filename or 'their file'}: {error.strerror or error}"
+            print_warning(
+                f"the presets' results are not kept for --budget ({why}); "
+                "try: an XDG_CACHE_HOME that can be written"
+            )
     if json:
         facts = {"page": str(page), "learned": kept and str(kept), "interrupted": interrupted}
         print_json({**facts, "rows": table(runs)})

@@ -144,13 +144,16 @@ class AsyncClient:
                 if status < core.BAD:  # an error may come in several parts, and is read below
                     *lines, rest = rest.split(b"\n")
                 if len(rest) > core.MOST_LINE_BYTES:
-                    raise NoDaemonError(f"the daemon on {self._target} sends a line of news that is too long")
+                    raise NoDaemonError(
+                        f"the daemon on {self._target} sends a line of news that is too long",
+                        hint=core.IF_FOREIGN,
+                    )
                 for line in lines:
                     for item in reader.take(line.decode(errors="replace").rstrip("\r")):
                         yield item
             if status >= core.BAD:
                 core.fact("events", Status).read(status, rest, self._target)
-        raise NoDaemonError(f"the daemon on {self._target} has ended")
+        raise NoDaemonError(f"the daemon on {self._target} has ended", hint=core.IF_ENDED)
 
     async def call(self, call: Call[T]) -> T:
         """Make a call; a command whose connection breaks is sent once more, with the same id."""
@@ -175,7 +178,9 @@ class AsyncClient:
                 else:
                     content += part
                 if len(content) > core.MOST_BYTES:
-                    raise NoDaemonError(f"the daemon on {self._target} sends an answer that is too long")
+                    raise NoDaemonError(
+                        f"the daemon on {self._target} sends an answer that is too long", hint=core.IF_FOREIGN
+                    )
         return call.read(status, content, self._target)
 
     async def _exchange(
@@ -206,10 +211,12 @@ class AsyncClient:
                     return
         except TimeoutError as error:
             raise NoDaemonError(
-                f"the daemon on {self._target} did not answer within {limit_s:g} s"
+                f"the daemon on {self._target} did not answer within {limit_s:g} s", hint=core.IF_SILENT
             ) from error
         except (OSError, h11.RemoteProtocolError) as error:
-            raise NoDaemonError(f"the daemon on {self._target} has closed the connection") from error
+            raise NoDaemonError(
+                f"the daemon on {self._target} has closed the connection", hint=core.IF_ENDED
+            ) from error
         finally:
             await _close(writer)
 

@@ -183,7 +183,7 @@ class Client:
                     f"the daemon is still {status.state} after {timeout_s:g} s of waiting for {wanted}{why}",
                     hint="acquire disarm, or wait for sealed: a recording's end leaves the instrument armed"
                     if staying
-                    else "",
+                    else "acquire status, or a longer timeout_s",
                 )
             time.sleep(POLL_S)
         return status
@@ -239,16 +239,17 @@ class Client:
                     yield from reader.take(line.decode(errors="replace").rstrip("\r\n"))
             except (OSError, http.client.HTTPException) as error:
                 raise NoDaemonError(
-                    f"the daemon on {self._target} has closed the connection while it was sending news"
+                    f"the daemon on {self._target} has closed the connection while it was sending news",
+                    hint=core.IF_ENDED,
                 ) from error
-        raise NoDaemonError(f"the daemon on {self._target} has ended")
+        raise NoDaemonError(f"the daemon on {self._target} has ended", hint=core.IF_ENDED)
 
     # ---- the connection
 
     def _do(self, call: Call[T]) -> T:
         try:
             return self._once(call)
-        except _BrokenError:
+        except _DisconnectedError:
             if call.request_id is None:
                 raise
         # Once more, with the same id: if the first request arrived, this one gets its answer, and nothing is
@@ -267,11 +268,13 @@ class Client:
                 return call.read(response.status, _content(response), self._target)
             except TimeoutError as error:
                 raise NoDaemonError(
-                    f"the daemon on {self._target} did not answer {call.name} within {call.timeout_s:g} s"
+                    f"the daemon on {self._target} did not answer {call.name} within {call.timeout_s:g} s",
+                    hint=core.IF_SILENT,
                 ) from error
             except (OSError, http.client.HTTPException) as error:
-                raise _BrokenError(
-                    f"the daemon on {self._target} has closed the connection during {call.name}"
+                raise _DisconnectedError(
+                    f"the daemon on {self._target} has closed the connection during {call.name}",
+                    hint=core.IF_ENDED,
                 ) from error
 
     @contextlib.contextmanager
@@ -321,7 +324,7 @@ class Client:
                 raise TimeoutError
 
 
-class _BrokenError(NoDaemonError):
+class _DisconnectedError(NoDaemonError):
     """The connection broke after the request was sent, so that it may or may not have been carried out."""
 
 

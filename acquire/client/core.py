@@ -57,6 +57,11 @@ API = "/api"
 BAD = 400
 """Lowest HTTP status that is an error."""
 
+IF_ENDED = "acquire status, and acquire serve if the daemon has ended"
+IF_SILENT = "acquire status, again in a moment; a host that is less busy, or the daemon started anew"
+IF_FOREIGN = "acquire serve or acquire web of this version, if another program listens there"
+"""What to try if the connection is lost, if no answer comes, and if the answer is none of the daemon's."""
+
 # A line break in either of them would begin a header of its own.
 _ID = re.compile(rf"[!-~]{{1,{LONGEST_ID}}}")
 _TOKEN = re.compile(r"[ -~]+")

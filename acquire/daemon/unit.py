@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from acquire.daemon.host import needed_bytes
-from acquire.place import default_socket
+from acquire.place import default_socket, home
 
 if TYPE_CHECKING:
     from acquire.config import RigConfig
@@ -48,8 +48,8 @@ class Place:
     @classmethod
     def of(cls, *, user: bool) -> Place:
         if user:
-            home = os.environ.get("XDG_CONFIG_HOME") or Path.home() / ".config"
-            return cls(True, Path(home) / "systemd/user")
+            configuration = os.environ.get("XDG_CONFIG_HOME") or home() / ".config"
+            return cls(True, Path(configuration) / "systemd/user")
         return cls(False, Path("/etc/systemd/system"))
 
 
@@ -59,7 +59,7 @@ def unit_text(rig: RigConfig, config: Path, *, user: bool, account: str | None =
     stop_s = round(rig.recording.seal_timeout_s) + STOP_S
     python = _word(Path(sys.executable))
     command = f"{python} -m acquire serve --config {_word(config.absolute())}"
-    who = account or pwd.getpwuid(os.geteuid()).pw_name
+    who = account or _own_account()
     # Of this host's groups, those whose members may use ports and USB devices.
     here = {group.gr_name for group in grp.getgrall()}
     groups = " ".join(name for name in ("dialout", "plugdev") if name in here)
@@ -73,9 +73,7 @@ def unit_text(rig: RigConfig, config: Path, *, user: bool, account: str | None =
         f"ExecReload={python} -m acquire reload{listens}",
         *([] if user else [f"User={who}"]),
         *([] if user or not groups else [f"SupplementaryGroups={groups}"]),
-        *([] if user else ["RuntimeDirectory=acquire"]),
-        # The directory of `SOCKET`, which is then the default socket of the daemon.
-        *([] if user else ["RuntimeDirectoryMode=0700", "Environment=XDG_RUNTIME_DIR=/run/acquire"]),
+        *([] if user else _directories()),
         f"WorkingDirectory={_quoted(recordings)}",
         f"WatchdogSec={WATCHDOG_S}",
         "Restart=on-failure",
@@ -111,6 +109,25 @@ def unit_text(rig: RigConfig, config: Path, *, user: bool, account: str | None =
             "",
         ]
     )
+
+
+def _own_account() -> str:
+    """This user's name, or the number of one who is in no list of accounts: systemd takes both."""
+    try:
+        return pwd.getpwuid(os.geteuid()).pw_name
+    except KeyError:
+        return str(os.geteuid())
+
+
+def _directories() -> list[str]:
+    return [
+        "RuntimeDirectory=acquire",
+        "RuntimeDirectoryMode=0700",
+        # For compiled loops, which every job of the page would compile anew: home and package are read-only.
+        "CacheDirectory=acquire",
+        # The former is the directory of `SOCKET`, which is then the default socket of the daemon.
+        "Environment=XDG_RUNTIME_DIR=/run/acquire NUMBA_CACHE_DIR=/var/cache/acquire",
+    ]
 
 
 def _hardening(recordings: Path, rig: RigConfig) -> list[str]:

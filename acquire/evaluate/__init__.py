@@ -19,3 +19,7 @@
 Nothing here opens a device or a socket. Only reports, pages and renderings write files; ``paper`` also makes
 the recordings that it needs.
 """
+
+from acquire.scratch import prepare_matplotlib
+
+prepare_matplotlib()

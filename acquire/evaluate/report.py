@@ -14,7 +14,7 @@ from acquire.errors import UsageError
 from acquire.evaluate import animation
 from acquire.evaluate.page import fill_template, webp_uri
 from acquire.evaluate.result import (
-    ArmLedger,
+    ArmAccount,
     CaptureFacts,
     DemoResult,
     Region,
@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from acquire.evaluate.themed import Drawing
 
 __all__ = [
-    "ArmLedger",
+    "ArmAccount",
     "CaptureFacts",
     "DemoResult",
     "Region",

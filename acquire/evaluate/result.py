@@ -38,7 +38,7 @@ class RigFacts:
 
 
 @dataclass(frozen=True, slots=True)
-class ArmLedger:
+class ArmAccount:
     """Account of one arm's lines since it was armed.
 
     The camera ``delivered`` lines, of which ``preroll`` were exposed before the start and ``discarded``
@@ -70,7 +70,7 @@ class CaptureFacts:
     end_reason: str
     seconds: float
     size_bytes: int
-    arms: Mapping[str, ArmLedger]
+    arms: Mapping[str, ArmAccount]
 
 
 # Not compared by value: `==` of two arrays is an array.

@@ -17,7 +17,7 @@ from acquire.lines import ARMS
 
 if TYPE_CHECKING:
     from acquire.evaluate.curves import CurveComparison
-    from acquire.evaluate.result import ArmLedger, CaptureFacts, DemoResult, SolverResult
+    from acquire.evaluate.result import ArmAccount, CaptureFacts, DemoResult, SolverResult
 
 
 def summarise(result: DemoResult) -> dict[str, Any]:
@@ -68,7 +68,7 @@ def capture_summary(capture: CaptureFacts) -> dict[str, Any]:
     }
 
 
-def ledger_summary(ledger: ArmLedger) -> dict[str, Any]:
+def ledger_summary(ledger: ArmAccount) -> dict[str, Any]:
     return {
         "delivered": ledger.delivered,
         "preroll": ledger.preroll,

@@ -18,17 +18,19 @@ from typing import TYPE_CHECKING, Any
 import numba
 import numpy as np
 
+from acquire.loops import compiled
+
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 
-@numba.njit(cache=True, inline="always")
+@compiled(inline="always")
 def _multiplicity(d: int, length: int, S: int) -> int:
     return min(d + 1, length, S, length + S - 1 - d)
 
 
 # without nnan and ninf: solvers notice that they diverge by values that are not finite
-@numba.njit(parallel=True, cache=True, fastmath={"contract", "reassoc", "nsz"})
+@compiled(parallel=True, fastmath={"contract", "reassoc", "nsz"})
 def shear(
     voxels: NDArray[Any],
     code: NDArray[np.uint8],
@@ -62,7 +64,7 @@ def shear(
                     out[i, c] += scale * voxels[frame, q, c]
 
 
-@numba.njit(parallel=True, cache=True, fastmath={"contract", "reassoc", "nsz"})
+@compiled(parallel=True, fastmath={"contract", "reassoc", "nsz"})
 def unshear(
     lines: NDArray[Any],
     code: NDArray[np.uint8],
@@ -97,7 +99,7 @@ def unshear(
                         out[f, q, c] += scale * lines[i, c]
 
 
-@numba.njit(cache=True)
+@compiled()
 def blocks_to_pixels(blocks: NDArray[Any], n: int, S: int, N_m: int) -> NDArray[Any]:
     """Return blocks·C_N, (L_R, n/N_m) → (L_R, M): every fine column adds its block's value to its pixel."""
     # Column by column, because a block can straddle two pixels if N_m does not divide S.
@@ -108,7 +110,7 @@ def blocks_to_pixels(blocks: NDArray[Any], n: int, S: int, N_m: int) -> NDArray[
     return pixels
 
 
-@numba.njit(cache=True)
+@compiled()
 def pixels_to_blocks(pixels: NDArray[Any], n: int, S: int, N_m: int) -> NDArray[Any]:
     """Return pixels·C_Nᵀ: (L_R, M) → (L_R, n/N_m)."""
     blocks = np.zeros((pixels.shape[0], (n + N_m - 1) // N_m), pixels.dtype)
@@ -118,7 +120,7 @@ def pixels_to_blocks(pixels: NDArray[Any], n: int, S: int, N_m: int) -> NDArray[
     return blocks
 
 
-@numba.njit(parallel=True, cache=True)
+@compiled(parallel=True)
 def transpose_frames(video: NDArray[Any], out: NDArray[Any]) -> None:
     """out[t] = video[t].T, frame by frame, so that both arms read contiguous rows."""
     for t in numba.prange(video.shape[0]):
@@ -127,7 +129,7 @@ def transpose_frames(video: NDArray[Any], out: NDArray[Any]) -> None:
                 out[t, c, r] = video[t, r, c]
 
 
-@numba.njit(parallel=True, cache=True)
+@compiled(parallel=True)
 def add_transposed_frames(video: NDArray[Any], out: NDArray[Any]) -> None:
     """out[t] += video[t].T."""
     for t in numba.prange(video.shape[0]):
@@ -136,7 +138,7 @@ def add_transposed_frames(video: NDArray[Any], out: NDArray[Any]) -> None:
                 out[t, c, r] += video[t, r, c]
 
 
-@numba.njit(cache=True, fastmath={"contract", "nsz"})
+@compiled(fastmath={"contract", "nsz"})
 def move_frame(
     frame: NDArray[Any],
     first: NDArray[np.uint64],
@@ -153,7 +155,7 @@ def move_frame(
             out[to + j] += weight[begin + j] * frame[at + j]
 
 
-@numba.njit(parallel=True, cache=True)
+@compiled(parallel=True)
 def move_frames(
     frames: NDArray[Any],
     first: NDArray[np.uint64],
@@ -167,7 +169,7 @@ def move_frames(
         move_frame(frames[k], first, source, begins, weight, out[k])
 
 
-@numba.njit(parallel=True, cache=True, fastmath={"contract", "nsz"})
+@compiled(parallel=True, fastmath={"contract", "nsz"})
 def blur_frames(
     frames: NDArray[Any],
     along: NDArray[np.int64],

@@ -18,7 +18,7 @@
     iterations     admm                  sign, tv, volume, ground, drift, denoisers, kernels: proximal steps
                     │
     judgement      estimates             what any solver returns
-                    ├─ judge             residuals and warnings; sanity, aliasing
+                    ├─ judge             residuals and warnings; sanity, aliasing, unseen
                     ├─ error_estimation  how far from the truth; error
                     └─ description_check whether code and geometry are right; diagnosis, search, hypotheses,
                                          gaussian, balance

@@ -23,7 +23,7 @@ from typing import TYPE_CHECKING
 
 from acquire.arrays import dot, namespace
 from acquire.errors import NumericsError
-from acquire.recon.denoisers import Checked
+from acquire.recon.denoisers import CheckedDenoiser
 from acquire.recon.sign import SignSplit
 from acquire.recon.tv import FrameTv
 
@@ -96,7 +96,7 @@ class Admm:
     ) -> None:
         self._samples, self._parameters = samples, parameters
         tv = FrameTv(parameters.tv_iterations, joint=parameters.joint_tv)
-        self._denoiser = Checked(denoiser) if denoiser else tv
+        self._denoiser = CheckedDenoiser(denoiser) if denoiser else tv
         self._xp, arrays = namespace(samples), basis.arrays
         self._emphasis = arrays.asarray(emphasis)
         # λ/ρ for each frame: the split's prox has λ·TV over ρ/2·‖·‖².

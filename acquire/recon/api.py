@@ -28,6 +28,7 @@ from acquire.recon.problem import build_problem
 from acquire.recon.result import Look, Progress, Quality, Reconstruction
 from acquire.recon.solve import KnownImage
 from acquire.recon.solver import Preset, Solver, open_solver, preset_iterations
+from acquire.recon.unseen import trusted_frames
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
@@ -203,7 +204,7 @@ class _Run:
         held_out = estimate.held_out_error
         prediction = problem.prediction_error(predicted) if held_out is None else held_out
         quality = Quality(problem.misfit(predicted), prediction, problem.coverage, self.given.noise)
-        trusted = segment.geometry.trusted_frames(T_m)
+        trusted, withdrawn = trusted_frames(segment, T_m)
         # Whoever stops a run wants the answer now.
         check = check and options.static_image is None and clock.ended != "stopped"
         checked = check_description(segment, quality, clock) if check else DescriptionCheck()
@@ -226,7 +227,7 @@ class _Run:
             video_error = "the reconstruction was stopped"
         elif error:
             video_error = estimate_error(self.given, estimate, video=video, quality=quality, cut=cut)
-        warnings = judge(segment, problem, quality, trusted)
+        warnings = (*withdrawn, *judge(segment, problem, quality, clock.ended))
         if period_frames := facts.get("period_frames"):
             repeats = describe_cycle(period_frames, facts["speed_changes"], segment.substep_ns * T_m)
             warnings = (*warnings, repeats)

@@ -148,7 +148,8 @@ def _followed(
     lamp_hz = cosine * cosine_hz(given.segment.substep_ns * options.temporal_merge, first.basis.frames)
     faster = f"the lines contain light of about {lamp_hz:.3g} Hz, faster than the band of the video"
     if options.bandwidth is not None or clock.spent(WIDER_SHARE):
-        clock.shortcuts.append(f"{faster}: a longer budget or a higher bandwidth shows it")
+        remedy = "a higher bandwidth" if options.bandwidth is not None else "more time or a higher bandwidth"
+        clock.shortcuts.append(f"{faster}: {remedy} shows it")
         return first, found
     clock.reset()
     if alone:

@@ -116,7 +116,7 @@ class AdmmSolver(Solver):
             return bench.finish(best_still(still, trials, merge=options.spatial_merge))
         volume = bench.attempt(bench.fitting(VOLUME), FIRST_ITERATIONS)
         if clock.spent(SEARCH_SHARE):
-            clock.shortcuts.append("the budget left no time to try more than one kind of motion")
+            clock.shortcuts.append(f"{clock.cause} left no time to try more than one kind of motion")
             return bench.finish(volume)
         return _choose(bench, volume, trials)
 

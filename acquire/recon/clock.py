@@ -44,7 +44,7 @@ class IterationClock:
 
     Time is wall time since ``began`` (`time.monotonic`; now if None), without compilation and without the
     time spent in ``on_look``, which is called after iterations that have a video. ``shortcuts`` are sentences
-    for the user about what was left out for lack of time.
+    for the user about what was left out for lack of time; ``cause`` is their subject.
     """
 
     on_look: Callable[[Look], object] | None = None
@@ -81,6 +81,11 @@ class IterationClock:
     def stop_requested(self) -> bool:
         """Whether the caller wants the answer now."""
         return self._stop is not None and self._stop.is_set()
+
+    @property
+    def cause(self) -> str:
+        """What leaves no more time: the caller's interruption, or the budget."""
+        return "the interruption" if self.stop_requested else "the budget"
 
     @property
     def compiled_s(self) -> float:

@@ -54,7 +54,7 @@ def begin_in_cosines(given: Given, basis: Basis, start: Array | None, *, explain
 
 
 def find_band(given: Given) -> int:
-    """Number of cosines: as requested, or as the lines show, or a few if the budget leaves no time."""
+    """Number of cosines: as requested, or as the lines show, or a few if no time is left."""
     segment, clock, frames = given.segment, given.clock, given.video_shape[0]
     if given.options.bandwidth is not None:
         return min(frames, max(1, round(given.options.bandwidth * frames)))
@@ -62,7 +62,7 @@ def find_band(given: Given) -> int:
         few = min(frames, FEWEST_COEFFICIENTS)
         limit_hz = few * cosine_hz(segment.substep_ns * given.options.temporal_merge, frames)
         clock.shortcuts.append(
-            "the budget left no time to search for the scene's bandwidth: the video holds only changes "
+            f"{clock.cause} left no time to search for the scene's bandwidth: the video holds only changes "
             f"slower than {limit_hz:.3g} Hz"
         )
         return few

@@ -39,7 +39,7 @@ def open_denoiser(name: str) -> Denoiser:
     return found
 
 
-class Checked:
+class CheckedDenoiser:
     """A denoiser whose results are checked, so that an error names the denoiser that caused it."""
 
     def __init__(self, denoiser: Denoiser) -> None:

@@ -11,7 +11,7 @@ from acquire.cores import limit_threads
 from acquire.recon.balance import balance_of
 from acquire.recon.hypotheses import Hypothesis, LineModel, Turn
 from acquire.recon.sanity import Suspicion, black_level_off, dark, suspicions, unusable
-from acquire.recon.search import Candidate, Inquiry, Standing, advantage, inquire
+from acquire.recon.search import Inquiry, Standing, WeighedHypothesis, advantage, inquire
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -31,7 +31,7 @@ UNEXPLAINED = "the code does not explain the lines: another seed, another run's 
 
 
 @dataclass(frozen=True, slots=True)
-class Row:
+class HypothesisRow:
     """One hypothesis of the table.
 
     ``likelier``: log likelihood over that of the description, also in standard ``errors``; ``agreement`` of
@@ -53,7 +53,7 @@ class Diagnosis:
 
     standing: Standing
     sentence: str
-    rows: tuple[Row, ...] = ()
+    rows: tuple[HypothesisRow, ...] = ()
     suspicions: tuple[Suspicion, ...] = ()
     hypothesis: Hypothesis | None = None
     alternative: Hypothesis | None = None
@@ -167,7 +167,7 @@ def _late(by: int) -> str:
     return f"{abs(by)} sub-step{'s' if abs(by) > 1 else ''} {'late' if by > 0 else 'early'}"
 
 
-def _rows(model: LineModel, inquiry: Inquiry) -> list[Row]:
+def _rows(model: LineModel, inquiry: Inquiry) -> list[HypothesisRow]:
     """The table: common mistakes, one at a time, and the candidates that were found, likeliest first."""
     described = inquiry.described
     S, plain = model.substeps, described.hypothesis
@@ -179,12 +179,12 @@ def _rows(model: LineModel, inquiry: Inquiry) -> list[Row]:
     # This is the prior of the description, with whose likelihood these are compared.
     model.fit_prior(plain)
     for each in tried:
-        found.setdefault(each, Candidate(each, model.evidence(each)))
+        found.setdefault(each, WeighedHypothesis(each, model.evidence(each)))
     found[plain] = described
     rows = []
     for candidate in found.values():
         likelier, errors = (0.0, 0.0) if candidate is described else advantage(candidate, described)
-        rows.append(Row(name_of(candidate.hypothesis), likelier, errors, candidate.agreement))
+        rows.append(HypothesisRow(name_of(candidate.hypothesis), likelier, errors, candidate.agreement))
     return sorted(rows, key=lambda row: -row.likelier)
 
 

@@ -182,13 +182,13 @@ class LineModel:
         gain = [view.gain(arm, each) for arm, (view, each) in enumerate(zip(views, scenes, strict=True))]
         return Evidence(np.concatenate(own), np.concatenate(gain))
 
-    def view(self, hypothesis: Hypothesis, arm: int) -> View:
+    def view(self, hypothesis: Hypothesis, arm: int) -> FittedArms:
         substeps = hypothesis.substeps or self.substeps
         return self._view(hypothesis.inverted, hypothesis.late[arm], substeps, hypothesis.random_code)
 
-    def _make_view(self, *exposure: *Exposure) -> View:
+    def _make_view(self, *exposure: *Exposure) -> FittedArms:
         prior = self.prior or self.fit_prior()
-        return View(Model.of(self._response(*exposure), prior, self.pixels), self.arms)
+        return FittedArms(Model.of(self._response(*exposure), prior, self.pixels), self.arms)
 
     def _response(self, inverted: bool, late: int, substeps: int, random_code: int) -> Response:
         rows = self.stages * substeps
@@ -203,7 +203,7 @@ class LineModel:
         return Response(lit, rows=rows, substeps=substeps, lines=self.lines, pixels=self.pixels, finer=finer)
 
 
-class View:
+class FittedArms:
     """Both arms under one code: their fits, and the scenes that follow from them."""
 
     def __init__(self, model: Model, arms: tuple[Floats, Floats]) -> None:

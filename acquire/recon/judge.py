@@ -23,6 +23,8 @@ because there are many voxels; `diagnosis` tells these apart."""
 WORTH_SAYING = 0.01
 """Smallest relative residual to report: less is a detail, 40 dB below the lines, that noise-free lines have,
 too."""
+TOO_EARLY = {"stopped": "it was interrupted too early", "budget": "its budget was too short"}
+"""What ended the iterations → that cause of a misfit in words, where others are possible."""
 POOR_COVERAGE = 0.8
 DENSITY = (0.1, 0.9)
 """Range of the share of lit sub-steps; codes outside leave frames unseen, or make them all alike."""
@@ -59,17 +61,18 @@ def frame_error(
     return np.where(level > 0, ratio, np.nan).astype(np.float32)
 
 
-def judge(segment: Segment, problem: Problem, quality: Quality, trusted: slice) -> tuple[str, ...]:
-    """Return the reasons not to trust this video, as sentences for the user."""
+def judge(segment: Segment, problem: Problem, quality: Quality, ended: str) -> tuple[str, ...]:
+    """Return the reasons not to trust a video that was ``ended`` thus, as sentences for the user."""
     # A constant code is reported below, by its density.
     found = [
         each.words for each in (*unusable(segment), *black_level_off(segment)) if each.kind != "constant_code"
     ]
     residual = float(np.nanmax([quality.misfit, quality.prediction]))
     if residual > POOR_MISFIT:
+        too_early = TOO_EARLY.get(ended, "there were too few iterations")
         found.append(
-            f"the video misses the lines by {residual:.0%}: there were too few iterations, or the code's "
-            "position, the arms' orientation or the black level is wrong"
+            f"the video misses the lines by {residual:.0%}: {too_early}, or the code's position, the arms' "
+            "orientation or the black level is wrong"
         )
     if quality.standing == "over-fitted":
         found.append(
@@ -93,6 +96,6 @@ def judge(segment: Segment, problem: Problem, quality: Quality, trusted: slice) 
             f"the light is on in {density:.0%} of the sub-steps: 50 % resolves fast changes best, "
             "very few leave frames unseen and very many leave them alike"
         )
-    if trusted.start >= trusted.stop and segment.geometry.lines < segment.geometry.stages:
+    if segment.geometry.lines < segment.geometry.stages:
         found.append("no frame is sampled in full: the segment has fewer lines than stages")
     return tuple(found)

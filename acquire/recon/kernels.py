@@ -21,6 +21,8 @@ from typing import TYPE_CHECKING, Any
 import numba
 import numpy as np
 
+from acquire.loops import compiled
+
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
@@ -35,7 +37,7 @@ SIGN_PIXELS = 1024
 _FAST = {"contract", "reassoc", "nsz", "arcp"}
 
 
-@numba.njit(parallel=True, cache=True, fastmath=_FAST)
+@compiled(parallel=True, fastmath=_FAST)
 def tv_prox(
     frames: NDArray[Any],
     weights: NDArray[Any],
@@ -60,7 +62,7 @@ def tv_prox(
         _primal(frames[k], dual[k, 0], dual[k, 1], weights[k], out[k])
 
 
-@numba.njit(cache=True, fastmath=_FAST)
+@compiled(fastmath=_FAST)
 def _primal(b: NDArray[Any], p: NDArray[Any], q: NDArray[Any], weight: float, x: NDArray[Any]) -> None:
     """x = b + weight·div(p, q), the last row of p and the last column of q being 0."""
     rows, columns = b.shape
@@ -73,7 +75,7 @@ def _primal(b: NDArray[Any], p: NDArray[Any], q: NDArray[Any], weight: float, x:
                 x[r, c] -= weight * p[r - 1, c]
 
 
-@numba.njit(cache=True, fastmath=_FAST)
+@compiled(fastmath=_FAST)
 def _dual_step(
     x: NDArray[Any],
     weight: float,
@@ -114,7 +116,7 @@ def _dual_step(
         q[-1, c] = new_q
 
 
-@numba.njit(parallel=True, cache=True, fastmath=_FAST)
+@compiled(parallel=True, fastmath=_FAST)
 def joint_tv_prox(
     frames: NDArray[Any],
     weights: NDArray[Any],
@@ -146,7 +148,7 @@ def joint_tv_prox(
         _joint_primal(frames, dual, r, weights, out)
 
 
-@numba.njit(cache=True, fastmath=_FAST)
+@compiled(fastmath=_FAST)
 def _joint_primal(
     b: NDArray[Any], dual: NDArray[Any], r: int, weights: NDArray[Any], x: NDArray[Any]
 ) -> None:
@@ -163,7 +165,7 @@ def _joint_primal(
                 row[c] -= weight * above[c]
 
 
-@numba.njit(cache=True, fastmath=_FAST)
+@compiled(fastmath=_FAST)
 def _joint_dual_step(
     x: NDArray[Any], r: int, steps: NDArray[Any], push: float, dual: NDArray[Any], ahead: NDArray[Any]
 ) -> None:
@@ -192,7 +194,7 @@ def _joint_dual_step(
                 old[c] = at
 
 
-@numba.njit(parallel=True, cache=True, fastmath=_FAST)
+@compiled(parallel=True, fastmath=_FAST)
 def tv_value(frames: NDArray[Any], out: NDArray[np.float64]) -> None:
     """out[k] = TV of frames[k], accumulated in float64."""
     rows, columns = frames.shape[1:]
@@ -240,7 +242,7 @@ def _volume_prox(
         _volume_primal(volume, dual, t, weight, pace, out[t])
 
 
-@numba.njit(cache=True, fastmath=_FAST)
+@compiled(fastmath=_FAST)
 def _volume_primal(
     b: NDArray[Any], dual: NDArray[Any], t: int, weight: float, pace: float, x: NDArray[Any]
 ) -> None:
@@ -256,7 +258,7 @@ def _volume_primal(
             x[r, c] += w * (dual[2, t, r, c] - before[r, c])
 
 
-@numba.njit(cache=True, fastmath=_FAST)
+@compiled(fastmath=_FAST)
 def _volume_dual_step(
     x: NDArray[Any],
     t: int,
@@ -301,12 +303,12 @@ def _volume_dual_step(
         s[-1] = new_s * shrink
 
 
-volume_prox = numba.njit(_volume_prox, cache=True, fastmath=_FAST)
-volume_prox_parallel = numba.njit(_volume_prox, parallel=True, cache=True, fastmath=_FAST)
+volume_prox = compiled(fastmath=_FAST)(_volume_prox)
+volume_prox_parallel = compiled(parallel=True, fastmath=_FAST)(_volume_prox)
 """As `volume_prox`, for volumes so large that three synchronisations of threads per iteration pay off."""
 
 
-@numba.njit(parallel=True, cache=True, fastmath=_FAST)
+@compiled(parallel=True, fastmath=_FAST)
 def sign_advance(
     theta: NDArray[Any], grid: NDArray[Any], scale: float, signed: NDArray[Any], pulled: NDArray[Any]
 ) -> None:
@@ -339,7 +341,7 @@ def sign_advance(
                         total[c] += weight * reflected[c]
 
 
-@numba.njit(parallel=True, cache=True, fastmath=_FAST)
+@compiled(parallel=True, fastmath=_FAST)
 def sign_pull(signed: NDArray[Any], scale: float, grid: NDArray[Any], out: NDArray[Any]) -> None:
     """out[k] = Σ_t grid[k, t]·(max(signed[t], 0) − scale·min(signed[t], 0)) for coefficients (k, r, c)."""
     count, instants = grid.shape
@@ -361,7 +363,7 @@ def sign_pull(signed: NDArray[Any], scale: float, grid: NDArray[Any], out: NDArr
                         total[c] += weight * reflected[c]
 
 
-@numba.njit(cache=True, fastmath=_FAST)
+@compiled(fastmath=_FAST)
 def add_outer(column: NDArray[Any], row: NDArray[Any], out: NDArray[Any]) -> None:
     """out[i, j] += column[i]·row[j]."""
     for i in range(out.shape[0]):

@@ -90,8 +90,9 @@ class Reconstruction:
     Attributes
     ----------
     video : (time, row, column) in scene units and the requested dtype, over the whole span; only the frames
-        in ``trusted`` were sampled in full (Fig. 5). That interval is nominal: it follows from the geometry
-        alone, whatever lines were lost, samples masked, or the code does; ``quality`` shows how well it went.
+        in ``trusted`` were sampled in full (Fig. 5)
+    trusted : the longest run of these frames without one of which an arm has no usable sample. Neither the
+        code nor the residual is considered: see ``believed``, ``ended`` and ``quality``
     time_ns : the beginning of each frame
     seconds : wall time without ``compiled_s``, the time of compilation, once after an installation
     processor_s : processor time of all threads

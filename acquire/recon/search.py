@@ -53,7 +53,7 @@ class Standing(StrEnum):
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Candidate:
+class WeighedHypothesis:
     """A hypothesis with its evidence.
 
     ``contrast``: gain of its orientation over the median of the others; ``agreement``: contrast or gain,
@@ -87,15 +87,15 @@ class Inquiry:
     """Result of a search: the segment as ``described``, and the best ``candidates``, best first."""
 
     standing: Standing
-    described: Candidate
-    candidates: tuple[Candidate, ...]
+    described: WeighedHypothesis
+    candidates: tuple[WeighedHypothesis, ...]
 
     @property
-    def best(self) -> Candidate:
+    def best(self) -> WeighedHypothesis:
         return self.candidates[0]
 
     @property
-    def rival(self) -> Candidate | None:
+    def rival(self) -> WeighedHypothesis | None:
         """Another candidate as likely as the best one that changes as little of the description."""
         for each in self.candidates[1:]:
             same_code = each.hypothesis.inverted == self.best.hypothesis.inverted
@@ -126,7 +126,9 @@ def _inquire(model: LineModel, substeps: int | None) -> Inquiry:
     described, straight = _search(model, Hypothesis(substeps=substeps))
     best = straight[0]
     opposites = [replace(each.hypothesis, inverted=True) for each in (best, described)]
-    inverted = max((Candidate(each, model.evidence(each)) for each in opposites), key=lambda each: each.total)
+    inverted = max(
+        (WeighedHypothesis(each, model.evidence(each)) for each in opposites), key=lambda each: each.total
+    )
     if best.verified and inverted.total < best.total:
         found = (*straight, inverted)
     else:
@@ -136,7 +138,7 @@ def _inquire(model: LineModel, substeps: int | None) -> Inquiry:
     return Inquiry(_standing(described, found), described, found)
 
 
-def _standing(described: Candidate, found: tuple[Candidate, ...]) -> Standing:
+def _standing(described: WeighedHypothesis, found: tuple[WeighedHypothesis, ...]) -> Standing:
     best = found[0]
     if not best.verified:
         agreement = max(best.agreement, described.agreement)
@@ -149,13 +151,13 @@ def _standing(described: Candidate, found: tuple[Candidate, ...]) -> Standing:
     return Standing.RIGHT if described.verified and described.gain >= best.gain else Standing.UNCLEAR
 
 
-def clearly(one: Candidate, other: Candidate) -> bool:
+def clearly(one: WeighedHypothesis, other: WeighedHypothesis) -> bool:
     """Whether the evidence for ``one`` is clearly better."""
     more, errors = advantage(one, other)
     return more > max(CLEAR, CLEAR_SHARE * one.gain) and errors > CLEAR_ERRORS and one.total > other.total
 
 
-def advantage(one: Candidate, other: Candidate) -> tuple[float, float]:
+def advantage(one: WeighedHypothesis, other: WeighedHypothesis) -> tuple[float, float]:
     """Log likelihood by which ``one`` is likelier than ``other``, and the same in standard errors.
 
     The arms' own evidence counts only if the codes differ in more than their delay: to an arm alone, a delay
@@ -167,7 +169,7 @@ def advantage(one: Candidate, other: Candidate) -> tuple[float, float]:
     return compare(one.evidence.total, other.evidence.total)
 
 
-def _search(model: LineModel, plain: Hypothesis) -> tuple[Candidate, tuple[Candidate, ...]]:
+def _search(model: LineModel, plain: Hypothesis) -> tuple[WeighedHypothesis, tuple[WeighedHypothesis, ...]]:
     """The plain hypothesis, and the best orientations with their delays, best first.
 
     Among candidates that are not clearly different, the one that changes least of the description is first.
@@ -210,7 +212,7 @@ class ByChance:
         floor = LEAST_CONTRAST
         return cls(max(contrast, floor), max(gain, floor), float(own.mean()), float(own.std(ddof=1)))
 
-    def judged(self, candidate: Candidate) -> Candidate:
+    def judged(self, candidate: WeighedHypothesis) -> WeighedHypothesis:
         """The candidate with its agreement, and its own evidence, relative to chance."""
         beyond = (float(candidate.evidence.own.sum()) - self.own) / max(self.spread, 1e-9)
         # A scene that looks the same turned has no contrast, and yet the arms agree on it.
@@ -218,13 +220,13 @@ class ByChance:
         return replace(candidate, agreement=agreement, beyond=beyond)
 
 
-def _first_look(model: LineModel, plain: Hypothesis) -> list[Candidate]:
+def _first_look(model: LineModel, plain: Hypothesis) -> list[WeighedHypothesis]:
     """The best delay of each orientation, best first."""
     across = [turn for turn in TURNS if turn.across]
-    best: dict[object, Candidate] = {}
+    best: dict[object, WeighedHypothesis] = {}
     for delay in DELAYS:
         tried = [replace(plain, late=(delay, delay), turn=turn) for turn in across]
-        found = _with_contrast([Candidate(each, model.evidence(each)) for each in tried])
+        found = _with_contrast([WeighedHypothesis(each, model.evidence(each)) for each in tried])
         for each in found:
             turn = each.hypothesis.turn
             if turn not in best or each.gain > best[turn].gain:
@@ -232,15 +234,15 @@ def _first_look(model: LineModel, plain: Hypothesis) -> list[Candidate]:
     return sorted(best.values(), key=lambda each: -each.gain)
 
 
-def _contrast(model: LineModel, hypothesis: Hypothesis) -> Candidate:
+def _contrast(model: LineModel, hypothesis: Hypothesis) -> WeighedHypothesis:
     """The hypothesis with its contrast to other orientations; a random code in its best orientation."""
     turns = [hypothesis.turn, *(turn for turn in TURNS if turn.across and turn != hypothesis.turn)]
     tried = [replace(hypothesis, turn=turn) for turn in turns]
-    found = _with_contrast([Candidate(each, model.evidence(each)) for each in tried])
+    found = _with_contrast([WeighedHypothesis(each, model.evidence(each)) for each in tried])
     return max(found, key=lambda each: each.gain) if hypothesis.random_code else found[0]
 
 
-def _with_contrast(found: list[Candidate]) -> list[Candidate]:
+def _with_contrast(found: list[WeighedHypothesis]) -> list[WeighedHypothesis]:
     """Each candidate with its gain over the median of the others."""
     gains = np.array([each.gain for each in found])
     return [

@@ -401,7 +401,7 @@ class Workbench:
                     best, improved = found, True
         return best
 
-    def finish(self, best: Trial) -> Chosen:
+    def finish(self, best: Trial) -> ChosenEstimate:
         """Solve the best trial with all samples, none held out, on the bench where it was tried."""
         if best.bench is not self:
             return best.bench.finish(best)
@@ -422,7 +422,7 @@ class Workbench:
             admm.step()
         if self.clock.ended == "done":  # all that a choice needs: not a run that was cut short
             self.clock.converged()
-        return Chosen(self, last)
+        return ChosenEstimate(self, last)
 
     def _background(self, basis: Basis) -> Array | None:
         return None if self.background is None else resized(self.background, basis)
@@ -442,7 +442,7 @@ class Workbench:
         return segment_operator(segment, basis, *self._merges, code=code)
 
 
-class Chosen:
+class ChosenEstimate:
     """Estimate of the candidate that was chosen."""
 
     def __init__(self, bench: Workbench, trial: Trial) -> None:

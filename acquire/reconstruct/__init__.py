@@ -7,7 +7,6 @@
     pools     where sub-segments are solved: in this process, in others, on a cluster
     work      one sub-segment: cut, solve, resample to the grid
     facts     what is recorded of its result, and whether it is trusted
-    unseen    the frames that one of the arms did not see
     sheet     its frames in the video: in a row, or behind a fibre tile by tile
     single    a reconstruction that is already in memory, made by `acquire.recon.reconstruct`
 

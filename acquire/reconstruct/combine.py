@@ -21,11 +21,11 @@ from acquire.plugins import DENOISERS, SOLVERS, of_others
 from acquire.recon.diagnosis import TURNED
 from acquire.recon.error import combined_facts
 from acquire.recon.segments import Stitcher
+from acquire.recon.unseen import Unseen, longest, remaining, within
 from acquire.reconstruct.arms import balance_of_recording
 from acquire.reconstruct.budget import Budget
 from acquire.reconstruct.sharing import SharedChoices, liveliest_first, sharing_facts
 from acquire.reconstruct.sheet import open_sheet
-from acquire.reconstruct.unseen import Unseen, longest, remaining, within
 from acquire.reconstruct.work import Task, as_read
 from acquire.store.present import flags_of
 from acquire.store.remote import is_url

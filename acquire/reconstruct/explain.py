@@ -36,7 +36,7 @@ NOTHING, ALL = "nothing", "all of it"
 
 
 @dataclass(frozen=True, slots=True)
-class Worth:
+class CorrectionWorth:
     """One trial: ``prediction`` is the relative error at held-out samples.
 
     ``gain_db`` is the loss of prediction without the part and ``time_factor`` the time with all parts over
@@ -56,7 +56,7 @@ def explain(
     spatial_merge: int,
     temporal_merge: int,
     progress: Callable[[int, int], object] = lambda _done, _all: None,
-) -> tuple[Worth, ...]:
+) -> tuple[CorrectionWorth, ...]:
     """Measure the benefit and cost of the parts of a calibration for a segment; `NOTHING` and `ALL` first.
 
     Raises what `calibrated` and `reconstruct` raise.
@@ -75,12 +75,17 @@ def explain(
     bare = _trial(segment, merges, bandwidth)
     whole = _trial(calibrated(segment, known), merges, bandwidth)
     progress(2, total)
-    found = [Worth(NOTHING, bare.prediction, bare.seconds), Worth(ALL, whole.prediction, whole.seconds)]
+    found = [
+        CorrectionWorth(NOTHING, bare.prediction, bare.seconds),
+        CorrectionWorth(ALL, whole.prediction, whole.seconds),
+    ]
     for number, (name, rest) in enumerate(parts.items()):
         left = _trial(calibrated(segment, rest), merges, bandwidth)
         # The factor is 20, because predictions are amplitudes.
         gain_db = 20 * math.log10(left.prediction / whole.prediction)
-        found.append(Worth(name, left.prediction, left.seconds, gain_db, whole.seconds / left.seconds))
+        found.append(
+            CorrectionWorth(name, left.prediction, left.seconds, gain_db, whole.seconds / left.seconds)
+        )
         progress(number + 3, total)
     return tuple(found)
 

@@ -33,20 +33,6 @@ def result_facts(result: Reconstruction) -> dict[str, Any]:
     }
 
 
-def warnings_of(result: Reconstruction, *, limited: bool) -> tuple[str, ...]:
-    """Return the result's warnings; those on what the budget cut name the interruption if that ended the run.
-
-    ``limited`` is whether there was a budget. The solver knows only that its time was over.
-    """
-    if result.ended != "stopped":
-        return result.warnings
-    cause = "the interruption, or the budget," if limited else "the interruption"
-    return tuple(
-        text.replace("the budget left", f"{cause} left").replace("a longer budget", "more time")
-        for text in result.warnings
-    )
-
-
 def why_not_trusted(result: Reconstruction, what: str) -> str | None:
     """Return why no frame is trusted, or None: the run was stopped, or too short to explain its lines.
 

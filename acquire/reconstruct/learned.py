@@ -18,6 +18,8 @@ from typing import TYPE_CHECKING
 
 from pydantic import TypeAdapter
 
+from acquire.place import home
+
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
 
@@ -41,7 +43,7 @@ class Learned:
 
 
 @dataclass(frozen=True, slots=True)
-class Choice:
+class PresetChoice:
     """The preferred preset, or None; ``why`` states the evidence, or why there is none."""
 
     preset: str | None
@@ -50,7 +52,7 @@ class Choice:
 
 def learned_path() -> Path:
     """Return ``$XDG_CACHE_HOME/acquire/tradeoff.json``, or the same under ``~/.cache``."""
-    cache = os.environ.get("XDG_CACHE_HOME") or str(Path.home() / ".cache")
+    cache = os.environ.get("XDG_CACHE_HOME") or str(home() / ".cache")
     return Path(cache) / "acquire" / "tradeoff.json"
 
 
@@ -88,7 +90,7 @@ def recall(path: Path | None = None) -> list[Learned]:
 
 def choose(
     known: Sequence[Learned], budget_s: float, voxels: int, merges: tuple[int, int] | None = None
-) -> Choice:
+) -> PresetChoice:
     """Choose the best preset on average, among those that end within ``budget_s`` for ``voxels`` voxels.
 
     ``known`` is of one solver. Times are scaled from those of the nearest number of voxels; if voxels of
@@ -96,7 +98,7 @@ def choose(
     size, of the one tried on most scenes. Presets are compared on the scenes that all of them were tried on.
     """
     if not known:
-        return Choice(None, "no preset was tried yet: run acquire tradeoff with several scenes")
+        return PresetChoice(None, "no preset was tried yet: run acquire tradeoff with several scenes")
     nearest = min(known, key=lambda each: abs(each.voxels - voxels)).voxels
     by_merges: dict[tuple[int, int], dict[str, dict[str, Learned]]] = defaultdict(lambda: defaultdict(dict))
     for each in known:
@@ -113,7 +115,7 @@ def choose(
     if len(scenes) < FEWEST_SCENES:
         tried = f"{len(scenes)} scene{'' if len(scenes) == 1 else 's'}"
         names = ", ".join(scenes) or "none in common"
-        return Choice(
+        return PresetChoice(
             None, f"presets were tried on {tried} ({names}), and {FEWEST_SCENES} are needed to prefer one"
         )
     # Time grows with the voxels; parts that are solved side by side end sooner, but the limit must hold on
@@ -126,7 +128,7 @@ def choose(
         if max(tried[scene].seconds for scene in scenes) * scale <= budget_s
     }
     if not in_time:
-        return Choice(None, f"no preset ended in that time on {len(scenes)} scenes")
-    return Choice(
+        return PresetChoice(None, f"no preset ended in that time on {len(scenes)} scenes")
+    return PresetChoice(
         max(in_time, key=in_time.__getitem__), f"learned from {len(scenes)} scenes: {', '.join(scenes)}"
     )

@@ -9,8 +9,7 @@ import numpy as np
 from acquire import __version__
 from acquire.plugins import DENOISERS, SOLVERS, of_others
 from acquire.recon.error import regions_of
-from acquire.reconstruct.facts import result_facts, warnings_of, why_not_trusted
-from acquire.reconstruct.unseen import find_unseen, longest, remaining, within
+from acquire.reconstruct.facts import result_facts, why_not_trusted
 from acquire.store import write_video
 
 if TYPE_CHECKING:
@@ -59,14 +58,7 @@ def describe(result: Reconstruction, recording: Recording, segment: Segment) -> 
     lines = segment.geometry.lines
     last = segment.first_line + lines - 1
     doubt = why_not_trusted(result, f"the video of lines {segment.first_line} to {last}")
-    T_m, origin = int(result.parameters["temporal_merge"]), segment.geometry.substeps * segment.first_line
-    whole = (origin + T_m * result.trusted.start, origin + T_m * result.trusted.stop)
-    unseen = within(find_unseen(segment, T_m), *whole)
-    first, stop = ((edge - origin) // T_m for edge in longest(remaining(whole, unseen), whole[0]))
-    untrusted = [
-        each.words((each.begin - origin) // T_m, -(-(each.end - origin) // T_m) - 1) for each in unseen
-    ]
-    warnings = warnings_of(result, limited=False)
+    first, stop = result.trusted.start, result.trusted.stop
     return {
         **result_facts(result),
         "recording": str(recording),
@@ -77,7 +69,7 @@ def describe(result: Reconstruction, recording: Recording, segment: Segment) -> 
         "denoiser": result.denoiser,
         "state": "interrupted" if result.ended == "stopped" else "complete",
         "trusted": [first, stop if doubt is None else first],
-        "warnings": [*([] if doubt is None else [doubt]), *untrusted, *warnings],
+        "warnings": [*([] if doubt is None else [doubt]), *result.warnings],
         "versions": {"acquire": __version__},
         "plugins": of_others([(SOLVERS, result.solver), (DENOISERS, result.denoiser or "")]),
     }

@@ -16,8 +16,8 @@ from acquire.recon.diagnosis import undo_turn
 from acquire.recon.error import regions_of
 from acquire.recon.hypotheses import AS_BUILT
 from acquire.recon.reuse import Choice
-from acquire.reconstruct.facts import result_facts, warnings_of, why_not_trusted
-from acquire.reconstruct.unseen import find_unseen, within
+from acquire.recon.unseen import find_unseen, trusted_frames, within
+from acquire.reconstruct.facts import result_facts, why_not_trusted
 from acquire.store import open_recording
 
 if TYPE_CHECKING:
@@ -167,7 +167,9 @@ def solve(task: Task, watch: Watch) -> Part:
     substeps = lines.geometry.substeps
     last = segment.first_line + segment.lines - 1
     doubt = why_not_trusted(result, f"the sub-segment of lines {segment.first_line} to {last}")
-    warnings = warnings_of(result, limited=options.budget_s is not None)
+    # The video has fewer frames that are not trusted than its sub-segments: `combine` names those.
+    _, withdrawn = trusted_frames(lines, voxels.temporal_merge)
+    warnings = [text for text in result.warnings if text not in withdrawn]
     unseen = within(find_unseen(lines, voxels.temporal_merge), segment.begin, segment.end)
     prefix = "" if task.tile is None else f"tile {task.tile}: "
     return Part(

@@ -131,7 +131,7 @@ class PulseTrain:
 
 
 @dataclass(frozen=True, slots=True)
-class Reading:
+class WireReading:
     """One reading of the wire: the latest train (None before the first) and its pulses so far."""
 
     train: PulseTrain | None
@@ -241,7 +241,7 @@ class Wire:
             )
             return allowed.budget or 0
 
-    def read(self) -> Reading:
+    def read(self) -> WireReading:
         """Return the latest train and the pulses it has issued at this moment."""
         return self._observe()[1]
 
@@ -249,7 +249,7 @@ class Wire:
         """Return the light's code during a train."""
         return code_from_attrs(train.code)
 
-    def wait(self, run: int, pulses: int, timeout_s: float) -> Reading:
+    def wait(self, run: int, pulses: int, timeout_s: float) -> WireReading:
         """Wait until train ``run`` has issued ``pulses`` pulses or has ended, for ``timeout_s`` at most.
 
         Returns the last reading, whatever it shows. A train later than ``run`` also ends the wait.
@@ -268,7 +268,7 @@ class Wire:
                 wake_ns, nap_s = min(wake_ns, reading.train.due_ns(pulses - 1)), _STOP_POLL_S
             self.clock.sleep(min(nap_s, max(wake_ns - now_ns, 1) * 1e-9))
 
-    def _observe(self) -> tuple[int, Reading]:
+    def _observe(self) -> tuple[int, WireReading]:
         """Return a sequence number and the reading that belongs to it."""
         for _ in attempts():
             sequence = self._sequence()
@@ -278,7 +278,7 @@ class Wire:
             if not sequence & 1 and self._refresh(sequence):
                 train, now_ns = self._known[1], self.clock.monotonic_ns()
                 if self._sequence() == sequence == self._known[0]:
-                    return sequence, Reading(train, 0 if train is None else train.issued(now_ns))
+                    return sequence, WireReading(train, 0 if train is None else train.issued(now_ns))
         raise DeviceError(
             "the simulated trigger died while it was writing to the wire",
             hint="arm again, which starts another",

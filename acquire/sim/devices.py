@@ -30,9 +30,9 @@ if TYPE_CHECKING:
     from acquire.config.device import CameraConfig
     from acquire.config.scene import SceneConfig
     from acquire.fibre import Fibre
-    from acquire.sim.clock import PulseTrain, Reading, Wire
+    from acquire.sim.clock import PulseTrain, Wire, WireReading
     from acquire.sim.pins import PinWire
-    from acquire.sim.pipeline import Camera
+    from acquire.sim.pipeline import ArmSource
     from acquire.sim.readout import Readout
 
 
@@ -66,7 +66,7 @@ class SimulatedOptics:
     def pixels(self) -> int:
         return self.geometry.stages if self.fibre is None else self.fibre.sensor_pixels
 
-    def expose(self, train: PulseTrain, code: Code, config: CameraConfig) -> Camera:
+    def expose(self, train: PulseTrain, code: Code, config: CameraConfig) -> ArmSource:
         """Return the lines of the arm's camera under a train's timing and the light's code."""
         from acquire.sim.pipeline import Bench  # imports scenes, which other optics do not need
 
@@ -221,7 +221,7 @@ class SimulatedCamera:
         """The line before which all were handed out or lost, since arming."""
         return self._ready[0].first_line if self._ready else self._delivered
 
-    def _behind(self, reading: Reading) -> int:
+    def _behind(self, reading: WireReading) -> int:
         """Return the lines due but not delivered. Raises CameraError once another train has started."""
         assert self._train is not None
         if reading.run > self._train:

@@ -8,15 +8,16 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-import numba
 import numpy as np
+
+from acquire.loops import compiled
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 
 # Without the interpreter's lock: `acquire simulate` reads each arm in a thread of its own.
-@numba.njit(cache=True, nogil=True)
+@compiled(nogil=True)
 def add_along_rows(
     frames: NDArray[Any], light: NDArray[Any], newest: NDArray[Any], rows: NDArray[Any], out: NDArray[Any]
 ) -> None:
@@ -30,7 +31,7 @@ def add_along_rows(
                     out[q, c] += light[i] * frames[i, r, c]
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled(nogil=True)
 def add_along_columns(
     frames: NDArray[Any], light: NDArray[Any], oldest: NDArray[Any], out: NDArray[Any]
 ) -> None:
@@ -50,7 +51,7 @@ def add_along_columns(
                     to[c] += light[i] * source[c]
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled(nogil=True)
 def chop(
     frames: NDArray[Any],
     angle: NDArray[Any],
@@ -79,7 +80,7 @@ def chop(
                 frames[i, r, c] *= min(1.0, max(0.0, 0.5 + distance))
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled(nogil=True)
 def paste(
     frames: NDArray[Any],
     picture: NDArray[Any],
@@ -114,7 +115,7 @@ def paste(
                     frames[i, r, c] = frames[i, r, c] * (1 - cover) + light
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled(nogil=True)
 def follow(target: NDArray[Any], rise: float, fall: float, level: NDArray[Any], out: NDArray[Any]) -> None:
     """Compute the mean over each step of light that follows its target with a first-order lag: (K, count).
 

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class PatternLight:
-    """A sensor that reads out stored lines, in place of `acquire.sim.pipeline.Camera`."""
+    """A sensor that reads out stored lines, in place of `acquire.sim.pipeline.ArmSource`."""
 
     pattern: Pattern
 

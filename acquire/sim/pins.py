@@ -27,7 +27,7 @@ import numpy as np
 from acquire.clock import NS_PER_S
 from acquire.errors import DeviceError
 from acquire.lines import ARMS
-from acquire.sim.clock import HostClock, PulseTrain, Reading, attempts
+from acquire.sim.clock import HostClock, PulseTrain, WireReading, attempts
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -167,17 +167,17 @@ class PinWire:
     arm: str
     clock: HostClock = field(default_factory=HostClock)
 
-    def read(self) -> Reading:
+    def read(self) -> WireReading:
         """Return the run that the pins show, as a pulse train, and this arm's pulses so far."""
         fields = [int(value) for value in self.page.read()]
         issued = fields[_PULSES + ARMS.index(self.arm)]
         if fields[_RUN] == 0:
-            return Reading(None, 0)
+            return WireReading(None, 0)
         period_ns = Fraction(fields[_PERIOD_CLOCKS] * NS_PER_S, fields[_CLOCK_HZ])
         delay_s = fields[_DELAYS + ARMS.index(self.arm)] / fields[_CLOCK_HZ]
         stopped = None if fields[_RUNNING] else issued
         code = {"kind": "pins", "run": fields[_RUN]}
-        return Reading(
+        return WireReading(
             PulseTrain(
                 run=fields[_RUN],
                 # The pins show which pulses have come, not when: times count from the run's start.
@@ -191,7 +191,7 @@ class PinWire:
             issued,
         )
 
-    def wait(self, run: int, pulses: int, timeout_s: float) -> Reading:
+    def wait(self, run: int, pulses: int, timeout_s: float) -> WireReading:
         """Wait as `Wire.wait` does."""
         deadline_s = time.monotonic() + timeout_s
         while True:

@@ -92,7 +92,7 @@ class Bench:
         kept = tuple(effect for effect in self.scene.effects if effect.kind not in effects)
         return replace(self, scene=self.scene.model_copy(update={"effects": kept}))
 
-    def camera(self, arm: str, code: Code) -> Camera:
+    def camera(self, arm: str, code: Code) -> ArmSource:
         """Return the camera of ``arm`` under a code. Raises UsageError for an impossible combination."""
         optics = self.scene.optics
         converter = Converter.of(self.cameras[arm])
@@ -134,7 +134,7 @@ class Bench:
         return scene if optics.layout != "interline" else binned(scene, optics.baseline_factor)
 
 
-class Camera(ABC):
+class ArmSource(ABC):
     """The source of one arm's lines; see `Bench.camera`."""
 
     stages: tuple[Stage, ...]
@@ -144,7 +144,7 @@ class Camera(ABC):
         """Return ``count`` lines from ``first_line`` on."""
 
 
-class Sensor(Camera):
+class Sensor(ArmSource):
     """One sensor with one image, or two side by side."""
 
     def __init__(
@@ -212,7 +212,7 @@ class Sensor(Camera):
         return self._converter.round(dn)
 
 
-class Merged(Camera):
+class Merged(ArmSource):
     """Raw lines of a sensor without sub-steps, merged S × S in the digital domain (Sect. 5.1).
 
     A merged sample is white if any of its raw samples is.
@@ -241,7 +241,7 @@ class Merged(Camera):
         return Readout(pixels.astype(self._converter.dtype), missing)
 
 
-class Cut(Camera):
+class Cut(ArmSource):
     """A range of columns of a sensor."""
 
     def __init__(self, sensor: Sensor, columns: slice) -> None:

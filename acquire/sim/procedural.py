@@ -84,7 +84,7 @@ class Recorded:
         return np.asarray(video[self.segment.geometry.trusted_frames(temporal_merge)], np.float32)
 
 
-class Stage:
+class Canvas:
     """Coordinates (0 to 1) and random texture of an n × n picture, on which a scene is drawn."""
 
     def __init__(self, n: int, span: int, seed: int) -> None:
@@ -129,12 +129,12 @@ def _over(ground: Image, mask: Image, value: float | Image) -> Image:
     return np.asarray(ground * (1 - mask) + mask * value)
 
 
-def bullet(s: Stage) -> Callable[[int, float], Image]:
+def bullet(s: Canvas) -> Callable[[int, float], Image]:
     row = s.rng.uniform(0.3, 0.7)
     return lambda _t, tau: _over(s.ground, s.box(row, -0.05 + 1.1 * tau, 0.052, 0.094), 0.05)
 
 
-def splash(s: Stage) -> Callable[[int, float], Image]:
+def splash(s: Canvas) -> Callable[[int, float], Image]:
     angle, far = np.arctan2(s.y - 0.55, s.x - 0.5), np.hypot(s.y - 0.55, s.x - 0.5)
     phases, drops = (
         s.rng.uniform(0, 2 * np.pi, 4),
@@ -158,13 +158,13 @@ def splash(s: Stage) -> Callable[[int, float], Image]:
     return frame
 
 
-def shock(s: Stage) -> Callable[[int, float], Image]:
+def shock(s: Canvas) -> Callable[[int, float], Image]:
     y, x = s.rng.uniform(0.4, 0.6, 2)
     far = np.hypot(s.y - y, s.x - x)
     return lambda _t, tau: 0.03 + 0.9 * s.inside(abs(far - 0.08 - 0.4 * tau**0.8) - 0.012)
 
 
-def disc(s: Stage) -> Callable[[int, float], Image]:
+def disc(s: Canvas) -> Callable[[int, float], Image]:
     far, angle, start = np.hypot(s.y - 0.5, s.x - 0.5), np.arctan2(s.y - 0.5, s.x - 0.5), s.rng.uniform(0, 6)
     mask, rings = s.inside(far - 0.4), np.floor(far / 0.1)
     turns = s.rng.uniform(0.5, 0.8)
@@ -176,7 +176,7 @@ def disc(s: Stage) -> Callable[[int, float], Image]:
     return frame
 
 
-def text(s: Stage) -> Callable[[int, float], Image]:
+def text(s: Canvas) -> Callable[[int, float], Image]:
     n, letters = s.n, "".join(s.rng.choice(list("ABCDEFGHKLMNPRSTXYZ0123456789"), 14))
     sheet = Pil.new("L", (3 * n, n))
     draw, font = ImageDraw.Draw(sheet), ImageFont.load_default(size=n // 4)
@@ -196,13 +196,13 @@ def text(s: Stage) -> Callable[[int, float], Image]:
     return frame
 
 
-def spark(s: Stage) -> Callable[[int, float], Image]:
+def spark(s: Canvas) -> Callable[[int, float], Image]:
     begin, (y, x) = int(s.rng.uniform(0.42, 0.58) * s.span), s.rng.uniform(0.3, 0.7, 2)
     flash = np.exp(-((s.y - y) ** 2 + (s.x - x) ** 2) / 2 / 0.07**2).astype(np.float32)
     return lambda t, _tau: 0.5 * s.ground + (2.0 * flash if begin <= t < begin + 12 else np.float32(0))
 
 
-def flame(s: Stage) -> Callable[[int, float], Image]:
+def flame(s: Canvas) -> Callable[[int, float], Image]:
     fields = [
         gaussian_filter(s.rng.standard_normal((3 * s.n, s.n)), s.n * k, mode="wrap") for k in (0.05, 0.1)
     ]
@@ -219,7 +219,7 @@ def flame(s: Stage) -> Callable[[int, float], Image]:
     return frame
 
 
-def flicker(s: Stage) -> Callable[[int, float], Image]:
+def flicker(s: Canvas) -> Callable[[int, float], Image]:
     rate = s.rng.uniform(9, 15)
 
     def frame(_t: int, tau: float) -> Image:
@@ -229,7 +229,7 @@ def flicker(s: Stage) -> Callable[[int, float], Image]:
     return frame
 
 
-def runner(s: Stage) -> Callable[[int, float], Image]:
+def runner(s: Canvas) -> Callable[[int, float], Image]:
     def frame(_t: int, tau: float) -> Image:
         x, swing, image = 0.1 + 0.8 * tau, 0.7 * np.sin(2 * np.pi * 3 * tau), s.ground * 0.6
         for angle in (swing, -swing):
@@ -241,7 +241,7 @@ def runner(s: Stage) -> Callable[[int, float], Image]:
     return frame
 
 
-def traffic(s: Stage) -> Callable[[int, float], Image]:
+def traffic(s: Canvas) -> Callable[[int, float], Image]:
     cars = s.rng.uniform([0.0, -1, 0.1], [1, 1, 1.0], (6, 3))
 
     def frame(_t: int, tau: float) -> Image:
@@ -255,7 +255,7 @@ def traffic(s: Stage) -> Callable[[int, float], Image]:
     return frame
 
 
-def _lamps(s: Stage, hertz: tuple[float, ...]) -> Callable[[int, float], Image]:
+def _lamps(s: Canvas, hertz: tuple[float, ...]) -> Callable[[int, float], Image]:
     shapes = [s.ball(0.27, 0.27, 0.16), s.box(0.27, 0.73, 0.24, 0.28), s.ball(0.73, 0.27, 0.17)]
     shapes[2] = shapes[2] * (1 - s.ball(0.73, 0.27, 0.08))
     steady = s.box(0.68, 0.73, 0.06, 0.3) + s.box(0.8, 0.73, 0.06, 0.3)
@@ -270,26 +270,26 @@ def _lamps(s: Stage, hertz: tuple[float, ...]) -> Callable[[int, float], Image]:
     return frame
 
 
-def leds(s: Stage) -> Callable[[int, float], Image]:
+def leds(s: Canvas) -> Callable[[int, float], Image]:
     return _lamps(s, (5e3, 2.5e3, 1e3))
 
 
-def leds_dot(s: Stage) -> Callable[[int, float], Image]:
+def leds_dot(s: Canvas) -> Callable[[int, float], Image]:
     lamps = _lamps(s, (5e3, 2.5e3, 1e3))
     return lambda t, tau: _over(lamps(t, tau), s.ball(0.5, 0.1 + 0.8 * tau, 0.05), 0.8)
 
 
-def fastled(s: Stage) -> Callable[[int, float], Image]:
+def fastled(s: Canvas) -> Callable[[int, float], Image]:
     return _lamps(s, (20e3, 1e3))
 
 
-def still(s: Stage) -> Callable[[int, float], Image]:
+def still(s: Canvas) -> Callable[[int, float], Image]:
     sharp = (s.texture(0.006, 0.02, 0.07) > 0.5).astype(np.float32)
     image = 0.15 + 0.7 * gaussian_filter(sharp, 0.5)
     return lambda _t, _tau: image
 
 
-def fan(s: Stage) -> Callable[[int, float], Image]:
+def fan(s: Canvas) -> Callable[[int, float], Image]:
     far, angle, start = np.hypot(s.y - 0.5, s.x - 0.5), np.arctan2(s.y - 0.5, s.x - 0.5), s.rng.uniform(0, 6)
     blades, rate = int(s.rng.integers(3, 6)), s.rng.uniform(5, 15)
     hub = s.inside(far - 0.38)
@@ -301,7 +301,7 @@ def fan(s: Stage) -> Callable[[int, float], Image]:
     return frame
 
 
-def string(s: Stage) -> Callable[[int, float], Image]:
+def string(s: Canvas) -> Callable[[int, float], Image]:
     rate, swing = s.rng.uniform(3, 12), s.rng.uniform(0.04, 0.1)
 
     def frame(_t: int, tau: float) -> Image:
@@ -316,7 +316,7 @@ def string(s: Stage) -> Callable[[int, float], Image]:
     return frame
 
 
-def piston(s: Stage) -> Callable[[int, float], Image]:
+def piston(s: Canvas) -> Callable[[int, float], Image]:
     rate, (y, x), crank, rod = s.rng.uniform(2.5, 10), (0.6, 0.3), 0.13, 0.45
 
     def frame(_t: int, tau: float) -> Image:
@@ -360,7 +360,7 @@ def light(
     Everything but lamps moves at 1 + Σ sᵢ·Pᵢ(x) of its usual speed, with ``speed_changes`` s₁, s₂, … and
     Legendre's polynomials Pᵢ over the span, x = −1 … 1.
     """
-    frame = SCENES[name](Stage(n, span, seed))
+    frame = SCENES[name](Canvas(n, span, seed))
     moved = Legendre([1.0, *speed_changes]).integ(lbnd=-1) / 2
     video = np.empty((span, n, n), np.float32)
     for t, tau in enumerate(moved(np.linspace(-1, 1, span))):

@@ -31,7 +31,7 @@ from acquire.sim.trigger_registers import (
     RegisterBank,
     constants,
 )
-from acquire.sim.trigger_run import Run
+from acquire.sim.trigger_run import ArmedRun
 from acquire.trigger import registers as r
 from acquire.trigger.frames import (
     Decoder,
@@ -77,7 +77,7 @@ class TriggerModel:
         self._decoder = Decoder()
         self._out: deque[bytes] = deque()
         self._tags: deque[bytes] = deque()
-        self._run = Run()
+        self._run = ArmedRun()
         self._zero = (wire.clock.monotonic_ns(), 0, Fraction(1))
         self._pps: tuple[int, int] = (0, 0)
         self._clock_losses = 0
@@ -221,7 +221,7 @@ class TriggerModel:
         self._tags.clear()
         line_clocks = self.registers.field(r.LINE, "substeps") * self.registers.get(r.SUBSTEP_CLOCKS)
         budget = self.registers.get(r.LINE_BUDGET) or None
-        self._run = Run(number, State.ARMED, line_clocks=line_clocks, budget=budget)
+        self._run = ArmedRun(number, State.ARMED, line_clocks=line_clocks, budget=budget)
 
     def _demand_idle(self, address: int) -> None:
         """Raise Refusal while a run is armed or running."""

@@ -8,7 +8,7 @@ from acquire.trigger.registers import EndReason, State
 
 
 @dataclass
-class Run:
+class ArmedRun:
     """The armed, running or ended run."""
 
     number: int = 0

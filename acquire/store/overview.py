@@ -54,7 +54,7 @@ ROWS = {"long_name": "mean of some lines", "units": "DN"}
 NUMBERS = {"long_name": "the trigger's number of the row's first line", "units": "1"}
 
 
-class Passing:
+class PassingOverview:
     """One arm's overview while its lines pass; rows are counted from ``first_line``."""
 
     def __init__(self, pixels: int) -> None:
@@ -97,7 +97,7 @@ class Passing:
 
 
 def write_overview(
-    publisher: Publisher, path: Path, passing: Mapping[str, Passing], spec: RecordingSpec, lines: int
+    publisher: Publisher, path: Path, passing: Mapping[str, PassingOverview], spec: RecordingSpec, lines: int
 ) -> dict[str, layout.Document]:
     """Write it for a recording of ``lines`` lines; return the metadata by path. Raises OSError."""
     # An arm that is ahead may have doubled its T once more.

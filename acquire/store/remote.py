@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from acquire.errors import PlaceError, StoreError, UsageError
+from acquire.place import home
 from acquire.store.place import put_bytes, put_copy
 from acquire.text import shortened
 
@@ -247,7 +248,7 @@ def _check_credentials(url: str) -> None:
     known = {name.upper() for name, value in os.environ.items() if value}
     if any(known.issuperset(way) for way in WAYS_IN[family]):
         return
-    if family == "gs" and (Path.home() / _GOOGLE_FILE).is_file():
+    if family == "gs" and (home() / _GOOGLE_FILE).is_file():
         return
     usual, *others = (" and ".join(way) for way in WAYS_IN[family])
     raise PlaceError(

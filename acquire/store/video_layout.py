@@ -91,7 +91,7 @@ def halved(frames: NDArray[Any]) -> NDArray[Any]:
 
 
 @dataclass(slots=True)
-class Window:
+class DisplayRange:
     """Black and white levels for viewers, from some voxels of every range of frames."""
 
     low: float = math.inf
@@ -141,7 +141,7 @@ class Window:
 
 
 def ome_attributes(
-    name: str, grid: VideoGrid, levels: int, window: Window, first_frame: int
+    name: str, grid: VideoGrid, levels: int, window: DisplayRange, first_frame: int
 ) -> dict[str, Any]:
     """Return the attribute ``ome``."""
     space = {"type": "space"} | ({"unit": grid.pixel_unit} if grid.pixel_unit else {})

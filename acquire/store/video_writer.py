@@ -62,7 +62,7 @@ class VideoWriter:
             fill_value = float("nan") if dtype.kind == "f" else 0
         self._place, self._delivery, self._grid = place, delivery_to(place), grid
         self._name = PurePosixPath(str(place)).stem
-        self._window, self._begin_ns = layout.Window(), 0
+        self._window, self._begin_ns = layout.DisplayRange(), 0
         # Until this has returned there is no ``with`` block that would remove what a full disk leaves.
         with ExitStack() as undo, refused(place, "written"):
             undo.callback(self._delivery.clear)

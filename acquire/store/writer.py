@@ -26,7 +26,7 @@ from acquire.store import layout
 from acquire.store.arm_writer import ArmWriter
 from acquire.store.codecs import EncodeOnce
 from acquire.store.files import DISK, SCRATCH, Publisher, check_new_path, lock
-from acquire.store.overview import Passing, withdraw_overview, write_overview
+from acquire.store.overview import PassingOverview, withdraw_overview, write_overview
 from acquire.store.pages import keep_freed_memory
 from acquire.store.rebuild import write_copy
 from acquire.store.refusals import CURES, refusal
@@ -95,7 +95,7 @@ class RecordingWriter:
         self._watch = RoomWatch(disk, path, spec.reserve_bytes)
         self._looked = self._watch.room
         self._stuck = False
-        self._overview: dict[str, Passing] = {arm: Passing(spec.pixels) for arm in ARMS}
+        self._overview: dict[str, PassingOverview] = {arm: PassingOverview(spec.pixels) for arm in ARMS}
         self._no_overview: str | None = None
         self._committed = 0
         self._own_due_s = 0.0

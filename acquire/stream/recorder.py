@@ -35,7 +35,7 @@ from acquire.stream.messages import Began, Begin, Cancel, End, Extend, Interrupt
 from acquire.stream.opening import Notes, Opening, is_verdict, not_created
 from acquire.stream.recorder_states import BUSY, STATES, TABLE, RecorderEvent, RecorderState, after
 from acquire.stream.session import OPEN_END, Session
-from acquire.stream.stalls import HELD_UP_S, Arm, Backlog, DiskWaits, HoldUps, find_stall
+from acquire.stream.stalls import HELD_UP_S, ArmView, Backlog, DiskWaits, HoldUps, find_stall
 from acquire.stream.tagger import Tagger
 from acquire.stream.window import hold, span
 
@@ -106,7 +106,7 @@ class Recorder:
     ) -> None:
         self._mailbox = mailbox
         self._plan = plan
-        self._arms = {name: Arm(ring) for name, ring in rings.items()}
+        self._arms = {name: ArmView(ring) for name, ring in rings.items()}
         self._tags = tags
         self._counters = counters
         self._disk = disk
@@ -379,7 +379,7 @@ class Recorder:
                 break
         return True
 
-    def _move(self, name: str, arm: Arm) -> bool:
+    def _move(self, name: str, arm: ArmView) -> bool:
         """Release the arm's last block and take the next one; return False if none is ready."""
         self._release(name, arm)
         arm.watch(time.monotonic(), self._counters[f"awaited_{name}"])
@@ -396,7 +396,7 @@ class Recorder:
             self._take(name, arm, block, self._session)
         return True
 
-    def _take(self, name: str, arm: Arm, block: RingBlock, session: Session) -> None:
+    def _take(self, name: str, arm: ArmView, block: RingBlock, session: Session) -> None:
         """Write the block; if the disk is too slow, end the recording while the rings still hold all lines.
 
         Once a ring has overflowed, the recording ends before the first line that found no room: whatever held
@@ -428,7 +428,7 @@ class Recorder:
             session.end(self._common_line(), reason, RunCondition.INTERRUPTED)
         self._hold_ups.took(block.committed_ns / 1e9)
 
-    def _release(self, name: str, arm: Arm) -> None:
+    def _release(self, name: str, arm: ArmView) -> None:
         """Release the arm's last block to its ring, once it is written."""
         lent, arm.lent = arm.lent, None
         if lent is None:

@@ -124,7 +124,7 @@ class HoldUps:
             self.longest_s = 0.0
 
 
-class Arm:
+class ArmView:
     """The recorder's view of a ring: its last sign of life, its backlog, the block being written, and the
     lines that recordings hold already.
     """
@@ -202,7 +202,7 @@ class Excess:
 
 
 def find_stall(
-    session: Session, arms: dict[str, Arm], looked_s: float, limit_s: float, max_skew_lines: int
+    session: Session, arms: dict[str, ArmView], looked_s: float, limit_s: float, max_skew_lines: int
 ) -> Stall | None:
     """Return the stall that ends the recording, or None; arms given up already do not count again.
 

@@ -5,8 +5,8 @@ costs no line: lines that it missed are not checked, which its counters show.
 
 ::
 
-    ring a ─▶ Intake ─┐  the same lines of both, twice a second     ┌▶ counters: verdicts
-    ring b ─▶ Intake ─┴─▶ Judge (`lightcheck`) ─────────────────────┼▶ Checked, when a verdict changes
+    ring a ─▶ means ──┐  the same lines of both, twice a second     ┌▶ counters: verdicts
+    ring b ─▶ means ──┴─▶ Judge (`lightcheck`) ─────────────────────┼▶ Checked, when a verdict changes
                    │                                                ├▶ Note, from which line on it holds
                    └────▶ Threshold ────────────────────────────────┴▶ Note, at a crossing
 """
@@ -53,7 +53,7 @@ _REPORT_EVERY_S = 0.1
 """Crossings that follow sooner than this on a reported one are only counted."""
 _MOST_COLUMNS = 128
 _MOST_PROFILE_LINES = 256
-"""At most so many columns of a line, and lines of a check, are averaged: see `Intake.take`."""
+"""At most so many columns of a line, and lines of a check, are averaged: see `BlockMeans.take`."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,7 +91,7 @@ class Watcher:
         self._counters = counters
         self._observers = {arm: Observer(ring, OBSERVER) for arm, ring in rings.items()}
         self._threshold = None if plan.threshold is None else Threshold(plan.threshold)
-        self._intakes: dict[str, Intake] = {}
+        self._intakes: dict[str, BlockMeans] = {}
         self._reported = dict.fromkeys(ARMS, Finding(Verdict.UNKNOWN))
         self._doubted: dict[str, bool | None] = dict.fromkeys(ARMS)
         """Whether doubt was reported last, per arm; None: nothing yet."""
@@ -109,7 +109,9 @@ class Watcher:
             first_line = max(ring.newest_line for ring in self._rings.values())
             self._next_s = now_s + _CHECK_EVERY_S
             self._intakes = {
-                arm: Intake(first_line, self._plan.lines, self._plan.black_dn[arm], self._plan.judge.white_dn)
+                arm: BlockMeans(
+                    first_line, self._plan.lines, self._plan.black_dn[arm], self._plan.judge.white_dn
+                )
                 for arm in ARMS
             }
         for arm, observer in self._observers.items():
@@ -192,7 +194,7 @@ class Watcher:
             self._counters[f"verified_line_{arm}"] = first_line
 
 
-class Intake:
+class BlockMeans:
     """Means of ``lines`` consecutive lines of one arm from ``first_line`` on, as the check needs them.
 
     Lines that were lost, overwritten unread or damaged are left out. `broken`: if these are more than half,

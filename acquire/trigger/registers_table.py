@@ -43,12 +43,12 @@ def registers_markdown() -> str:
         "",
         "## Access",
         "",
-        "constant: never changes. read: changed by the device. config: can be written while no run is armed "
-        "or running, and reads back. operand: can be written at any time, and reads back. command: acts when "
+        "constant: never changes. read: changed by the device. config: can be written while no run is armed",
+        "or running, and reads back. operand: can be written at any time, and reads back. command: acts when",
         "written, and reads as 0.",
         "",
-        "Bits are counted from the lowest bit of the register's first word. The reset value is the value at "
-        "power-up. The values of a field are listed in [PROTOCOL.md](PROTOCOL.md). A host must first compare "
+        "Bits are counted from the lowest bit of the register's first word. The reset value is the value at",
+        "power-up. The values of a field are listed in [PROTOCOL.md](PROTOCOL.md). A host must first compare",
         "ID, VERSION.protocol and MAP with the values given here.",
         "",
         "## Map",

@@ -70,7 +70,7 @@ log = logging.getLogger("acquire.web")
 T = TypeVar("T")
 
 
-class Reading:
+class DiskReads:
     """One thread for all work that waits for the disk, with a limited number of waiting requests."""
 
     def __init__(self) -> None:
@@ -93,7 +93,7 @@ class Reading:
         self._thread.shutdown(wait=False, cancel_futures=True)
 
 
-async def _prepare(archive: Archive, reading: Reading) -> None:
+async def _prepare(archive: Archive, reading: DiskReads) -> None:
     with contextlib.suppress(AcquireError):  # whoever asks for the lists is told
         await reading(archive.recordings)
         await reading(archive.videos)
@@ -107,7 +107,7 @@ def build_page(
     Must be called from within the event loop that will serve it. ``secure``: only over https.
     """
     hub = Hub(socket, Live)
-    archive, reading = Archive(directory), Reading()
+    archive, reading = Archive(directory), DiskReads()
     jobs = Jobs(directory, archive, socket)
 
     @asynccontextmanager
@@ -197,7 +197,7 @@ def _add_stream(api: APIRouter, pages: Pages) -> None:
         return StreamingResponse(stream, media_type="application/octet-stream", headers=NO_STORE)
 
 
-def _add_recordings(api: APIRouter, archive: Archive, reading: Reading, answers: Answers) -> None:
+def _add_recordings(api: APIRouter, archive: Archive, reading: DiskReads, answers: Answers) -> None:
     @api.get("/recordings", summary="Recordings, newest first")
     async def recordings() -> list[RecordingFacts]:
         return await reading(archive.recordings)
@@ -271,7 +271,7 @@ def _add_jobs(api: APIRouter, jobs: Jobs, answers: Answers) -> None:
 
 
 def _add_calibration(
-    api: APIRouter, hub: Hub, jobs: Jobs, directory: Path, reading: Reading, answers: Answers
+    api: APIRouter, hub: Hub, jobs: Jobs, directory: Path, reading: DiskReads, answers: Answers
 ) -> None:
     @api.get("/calibration", summary="The calibration: its steps and their findings")
     async def calibration() -> CalibrationFacts:

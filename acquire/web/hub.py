@@ -157,7 +157,12 @@ class Hub:
         while True:
             await asyncio.sleep(RETRY_S)
             if self.connected and time.monotonic() - self._heard_s > LOST_S:
-                self._lose(NoDaemonError(f"the daemon has not sent anything for {LOST_S:g} s"))
+                self._lose(
+                    NoDaemonError(
+                        f"the daemon has not sent anything for {LOST_S:g} s",
+                        hint="acquire status; if it gets no answer either, start the daemon anew",
+                    )
+                )
 
     def _lose(self, error: Exception) -> None:
         if self.connected:

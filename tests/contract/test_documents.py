@@ -38,6 +38,7 @@ QUOTED = re.compile(r"\"([^\"\n]+)\"")
 SPOKEN = re.compile(r"`([a-z]+ [^`\n]* [^`\n]*)`")
 """Three or more words in backticks: what the program prints, and no name."""
 SHORTEST_WORDS = 8
+LONGEST_LINE = 150
 
 
 def names(paths: list[Path]) -> list[Any]:
@@ -109,6 +110,16 @@ def test_the_check_of_commands_sees_what_is_wrong() -> None:
     assert called("A=1 true && .venv/bin/acquire arm --force | cat # --no") == [["arm", "--force"]]
     tour = (ROOT / "README.md").read_text(encoding="utf-8")
     assert {"demo", "serve", "arm", "start", "status"} <= {c[0] for s in shown(tour) for c in called(s)}
+
+
+@pytest.mark.parametrize("path", names(DOCUMENTS))
+def test_lines_are_wrapped(path: Path) -> None:
+    """Rows of tables and addresses of pictures cannot be."""
+    lines = path.read_text(encoding="utf-8").splitlines()
+    long = [number for number, line in enumerate(lines, 1) if len(line) > LONGEST_LINE]
+    assert [n for n in long if not lines[n - 1].startswith(("|", "!["))] == [], (
+        f"wrap at {LONGEST_LINE} columns"
+    )
 
 
 @pytest.mark.parametrize("path", names(DOCUMENTS))

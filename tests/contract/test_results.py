@@ -30,7 +30,7 @@ def test_a_run_is_kept_with_its_origin_and_shown_as_a_table(
     assert kept.machine.cores >= 1
     assert kept.machine.cpu
     assert kept.machine.load_before >= 0
-    assert table(choose(read(file), "bench_store", None)).splitlines()[1:] == [
+    assert table(choose(read(file), "bench_store", None)).splitlines()[2:] == [
         "",
         "| case | MB/s | cpu (s per GB) |",
         "| --- | --- | --- |",

@@ -283,6 +283,7 @@ def test_the_unit_says_when_it_is_ready_and_what_it_may_not(tmp_path: Path) -> N
     rings, scene = needed_bytes(rig_config(tmp_path))
     assert rings + scene < int(unit["MemoryLow"].removesuffix("M")) * 1e6 < memory_bytes()
     assert unit["NoNewPrivileges"] == "yes"
+    assert f"NUMBA_CACHE_DIR=/var/cache/{unit['CacheDirectory']}" in unit["Environment"].split()
     assert "User" not in unit_of(tmp_path, user=True)
 
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from acquire.evaluate.host import Busyness
 from acquire.evaluate.report import (
-    ArmLedger,
+    ArmAccount,
     CaptureFacts,
     DemoResult,
     Region,
@@ -82,8 +82,8 @@ def make_result() -> DemoResult:
             seconds=0.617,
             size_bytes=5_312_204,
             arms={
-                "a": ArmLedger(20_075, 65, 7, 20_003, 0, 9, 64),
-                "b": ArmLedger(20_077, 65, 11, 20_003, 16, 11, 64, {"camera": 2, "ring_full": 14}),
+                "a": ArmAccount(20_075, 65, 7, 20_003, 0, 9, 64),
+                "b": ArmAccount(20_077, 65, 11, 20_003, 16, 11, 64, {"camera": 2, "ring_full": 14}),
             },
         ),
         segment=segment,

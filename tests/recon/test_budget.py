@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 import time
 from itertools import pairwise
 
@@ -201,4 +202,17 @@ def test_an_impossible_budget_that_is_not_refused_does_the_minimum() -> None:
     result = reconstruct(segment(Geometry(20, 3, 120)), 3, 1, budget_s=1e-6, refuse=False)
     assert result.iterations <= 3
     assert result.ended == "budget"
-    assert any("no time to try more" in each for each in result.warnings)
+    assert any("the budget left no time to try more" in each for each in result.warnings)
+    assert any("its budget was too short" in each for each in result.warnings)
+
+
+@pytest.mark.parametrize("budget_s", [None, 60.0])
+def test_an_interrupted_run_names_the_interruption(budget_s: float | None) -> None:
+    """It blamed a budget that it may not have had, and too few iterations."""
+    stop = threading.Event()
+    lines = segment(Geometry(20, 3, 120))
+    result = reconstruct(lines, 3, 1, budget_s=budget_s, stop=stop, progress=lambda _: stop.set())
+    assert result.ended == "stopped"
+    assert any("the interruption left no time to try more" in each for each in result.warnings)
+    assert any("it was interrupted too early" in each for each in result.warnings)
+    assert not any("budget" in each or "too few" in each for each in result.warnings)

@@ -14,6 +14,7 @@ from acquire.errors import UsageError
 from acquire.flags import LineFlag
 from acquire.recon import reconstruct
 from acquire.recon.segments import Voxels
+from acquire.recon.unseen import Unseen, find_unseen, longest, remaining, within
 from acquire.reconstruct import (
     Options,
     Watcher,
@@ -23,8 +24,6 @@ from acquire.reconstruct import (
     in_voxels,
     open_pool,
 )
-from acquire.reconstruct.facts import warnings_of
-from acquire.reconstruct.unseen import Unseen, find_unseen, longest, remaining, within
 from acquire.store import open_recording
 
 if TYPE_CHECKING:
@@ -87,16 +86,23 @@ def test_lines_that_both_arms_have_withdraw_nothing(recording_path: Path, tmp_pa
     assert not any("no usable sample" in text for text in facts["warnings"])
 
 
-def test_a_reconstruction_in_memory_is_recorded_without_them(recording_path: Path, tmp_path: Path) -> None:
+def test_a_reconstruction_in_memory_trusts_the_frames_that_its_record_does(
+    recording_path: Path, tmp_path: Path
+) -> None:
+    """The record left them out, and `result.trusted` had them."""
     recording = spoiled(recording_path, tmp_path / "r.zarr", range(30, 60))
     segment = recording.cut(0, 80)
     result = reconstruct(segment, 4, 3, iterations=2, check=False, error=False, solver="twist")
     facts = describe(result, recording, segment)
     (unseen,) = find_unseen(segment, 3)
     first, stop = unseen.begin // 3, unseen.end // 3
-    assert result.trusted.start < first < stop < result.trusted.stop
-    assert facts["trusted"] == [result.trusted.start, first]
-    assert facts["warnings"][0].startswith(f"frames {first} to {stop - 1} are not trusted: arm a")
+    sampled = segment.geometry.trusted_frames(3)
+    assert sampled.start < first < stop < sampled.stop
+    assert result.trusted == slice(sampled.start, first)
+    assert facts["trusted"] == [sampled.start, first]
+    (said,) = [text for text in result.warnings if "no usable sample" in text]
+    assert said.startswith(f"frames {first} to {stop - 1} are not trusted: arm a")
+    assert facts["warnings"].count(said) == 1
 
 
 @pytest.mark.parametrize("lost", [False, True], ids=["saturated", "flagged as missing"])
@@ -139,19 +145,3 @@ def test_ranges_of_one_arm_join_and_what_remains_is_found() -> None:
     assert remaining((12, 25), joined) == []
     assert longest(remaining((0, 40), joined), 0) == (25, 40)
     assert longest([], 7) == (7, 7)
-
-
-@pytest.mark.parametrize(
-    ("ended", "limited", "words"),
-    [
-        ("stopped", False, "the interruption left no time to try more"),
-        ("stopped", True, "the interruption, or the budget, left no time to try more"),
-        ("budget", True, "the budget left no time to try more"),
-    ],
-)
-def test_a_result_that_was_interrupted_does_not_blame_a_budget(
-    recording_path: Path, ended: str, limited: bool, words: str
-) -> None:
-    result = reconstruct(open_recording(recording_path).cut(0, 40), 4, 3, iterations=1, check=False)
-    result = replace(result, ended=ended, warnings=("the budget left no time to try more",))
-    assert warnings_of(result, limited=limited) == (words,)

@@ -18,7 +18,7 @@ from acquire.errors import DataError
 from acquire.lines import ARMS, LineFlag, TaggedBlock
 from acquire.store import Recording, RecordingWriter, RunCondition, mirror, open_recording, recover, verify
 from acquire.store.files import DISK, Disk
-from acquire.store.overview import AVERAGED, CHUNKS, FIRST_STEP, MOST_ROWS, NAME, Passing
+from acquire.store.overview import AVERAGED, CHUNKS, FIRST_STEP, MOST_ROWS, NAME, PassingOverview
 
 SPEC = make_spec(chunk_lines=64, shard_chunks=8)
 
@@ -58,7 +58,7 @@ def expected(arm: str, rows: int, step: int, lost: frozenset[int] = frozenset())
 @settings(max_examples=30, deadline=None)
 @given(lines=st.integers(0, 700), block_lines=st.integers(1, 300), rows=st.sampled_from([2, 4, 1024]))
 def test_rows_are_means_however_lines_come(lines, block_lines, rows):
-    passing = Passing(SPEC.pixels)
+    passing = PassingOverview(SPEC.pixels)
     passing._sums, passing._counts = passing._sums[:rows], passing._counts[:rows]
     for start in range(0, lines, block_lines):
         passing.add(Truth(SPEC).block("a", 1000 + start, min(block_lines, lines - start)), 1000)
@@ -84,8 +84,8 @@ def test_other_programs_see_it(tmp_path):
 
 
 def test_it_stays_small(tmp_path, monkeypatch):
-    assert len(Passing(2**16)._counts) == 64
-    assert len(Passing(192)._counts) == MOST_ROWS
+    assert len(PassingOverview(2**16)._counts) == 64
+    assert len(PassingOverview(192)._counts) == MOST_ROWS
     monkeypatch.setattr("acquire.store.overview.MOST_ROWS", 4)
     recording = record(tmp_path / "r.zarr", 1500)
     overview = recording.overview("b")

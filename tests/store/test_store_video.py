@@ -158,7 +158,7 @@ def test_a_large_video_has_smaller_copies(tmp_path, monkeypatch):
 
 
 def test_what_a_viewer_shows_is_bounded_in_memory():
-    window = video_layout.Window()
+    window = video_layout.DisplayRange()
     generator = np.random.default_rng(3)
     for _ in range(300):
         window.add(generator.normal(10.0, 1.0, (4, 50, 50)).astype(np.float32))
@@ -328,7 +328,7 @@ def test_a_pipe_in_the_place_of_a_video_keeps_nobody_waiting(tmp_path):
 @pytest.mark.parametrize("times", [1, 40])
 def test_black_and_white_are_those_of_all_columns(times: int) -> None:
     """Every 64th voxel of rows of 64 was one of the first column, and every other one of a half."""
-    window = video_layout.Window()
+    window = video_layout.DisplayRange()
     frames = np.zeros((1024, 64, 64), np.float32)
     frames[:, :, 1::2] = 1.0
     frames[:, :, 20] = 3.0

@@ -13,20 +13,20 @@ from acquire.store import RunCondition
 from acquire.stream.losses import Cause
 from acquire.stream.ring import Ring, RingShape
 from acquire.stream.session import Session
-from acquire.stream.stalls import HELD_UP_S, Arm, Excess, Heartbeat, HoldUps, find_stall
+from acquire.stream.stalls import HELD_UP_S, ArmView, Excess, Heartbeat, HoldUps, find_stall
 
 LIMIT_S, SKEW = 10.0, 1000
 
 
 @pytest.fixture
-def arms() -> Iterator[dict[str, Arm]]:
+def arms() -> Iterator[dict[str, ArmView]]:
     rings = {name: Ring(name, RingShape(4, 16, 1, "uint8")) for name in "ab"}
-    yield {name: Arm(ring) for name, ring in rings.items()}
+    yield {name: ArmView(ring) for name, ring in rings.items()}
     for ring in rings.values():
         ring.close()
 
 
-def silence(arms: dict[str, Arm], a: float, b: float) -> None:
+def silence(arms: dict[str, ArmView], a: float, b: float) -> None:
     now_s = time.monotonic()
     arms["a"].revive(now_s - a)
     arms["b"].revive(now_s - b)
@@ -49,7 +49,7 @@ def make(lines: int | None = None) -> Session:
     ],
 )
 def test_silent_arms_are_named(
-    arms: dict[str, Arm], a: float, b: float, stalled: tuple[str, ...] | None
+    arms: dict[str, ArmView], a: float, b: float, stalled: tuple[str, ...] | None
 ) -> None:
     silence(arms, a, b)
     found = find_stall(make(), arms, time.monotonic(), LIMIT_S, SKEW)
@@ -60,7 +60,7 @@ def test_silent_arms_are_named(
         assert "no line for 10 s" in found.reason
 
 
-def test_an_arm_that_has_all_its_lines_or_is_given_up_is_not_waited_for(arms: dict[str, Arm]) -> None:
+def test_an_arm_that_has_all_its_lines_or_is_given_up_is_not_waited_for(arms: dict[str, ArmView]) -> None:
     silence(arms, LIMIT_S * 2, 0.0)
     assert find_stall(make(lines=100), arms, time.monotonic(), LIMIT_S, SKEW) is None
     session = make()
@@ -68,7 +68,7 @@ def test_an_arm_that_has_all_its_lines_or_is_given_up_is_not_waited_for(arms: di
     assert find_stall(session, arms, time.monotonic(), LIMIT_S, SKEW) is None
 
 
-def test_an_arm_that_lags_too_far_is_named(arms: dict[str, Arm]) -> None:
+def test_an_arm_that_lags_too_far_is_named(arms: dict[str, ArmView]) -> None:
     session = make()
     assert session.skew == 20
     session.take("a", ring_block("a", 100, SKEW))
@@ -78,7 +78,7 @@ def test_an_arm_that_lags_too_far_is_named(arms: dict[str, Arm]) -> None:
     assert f"{SKEW + 20} lines behind" in found.reason
 
 
-def test_what_waits_in_the_ring_is_life(arms: dict[str, Arm]) -> None:
+def test_what_waits_in_the_ring_is_life(arms: dict[str, ArmView]) -> None:
     arm = arms["a"]
     now_s = arm.alive_s
     arm.watch(now_s + 1)

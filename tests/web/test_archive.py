@@ -39,7 +39,7 @@ from acquire.store.source import Source
 from acquire.stream.tagger import Tagger
 from acquire.trigger.base import TriggerRun
 from acquire.web import archive as archive_module
-from acquire.web.app import Reading, _prepare
+from acquire.web.app import DiskReads, _prepare
 from acquire.web.archive import LINES_PER_ROW, LOST_COLOUR, PICTURE_ROWS, Archive, _arm_overview
 from acquire.web.messages import HoldRequest
 
@@ -195,7 +195,7 @@ def test_the_first_list_is_made_before_anybody_asks(tmp_path: Path) -> None:
     with RecordingWriter.create(tmp_path / "run.zarr", recording_spec(LOAD, CLOCK)) as writer:
         writer.seal(RunCondition.GOOD, "stopped", {})
     known, absent = Archive(tmp_path), Archive(tmp_path / "absent")
-    with contextlib.closing(Reading()) as reading:
+    with contextlib.closing(DiskReads()) as reading:
         asyncio.run(_prepare(known, reading))
         asyncio.run(_prepare(absent, reading))  # whoever asks for that list is told
     assert set(known._facts) == {"run.zarr"}

@@ -12,13 +12,14 @@ from acquire.cli.progress import stage_progress
 from acquire.config.scene import SineDrive
 from acquire.evaluate.host import HostWatch
 from acquire.evaluate.report import (
-    ArmLedger,
+    ArmAccount,
     CaptureFacts,
     DemoResult,
     Region,
     RigFacts,
     evaluate_solver,
 )
+from acquire.loops import how_often
 from acquire.recon import Reconstruction, reconstruct
 from acquire.reconstruct import save_reconstruction
 from acquire.sim.leds import LedScene, LedSceneConfig
@@ -131,9 +132,7 @@ def _solve(method: Method, segment: Segment, journal: Journal) -> Reconstruction
         )
         note["detail"] = f"{result.iterations} iterations"
         if result.compiled_s >= REPORTED_S:
-            note["detail"] += (
-                f", including {result.compiled_s:.1f} s of compilation, needed once per installation"
-            )
+            note["detail"] += f", including {result.compiled_s:.1f} s of compilation, needed {how_often()}"
     return result
 
 
@@ -194,7 +193,7 @@ def _capture_facts(recording: Recording, captured: Captured) -> CaptureFacts:
         seconds=captured.seconds,
         size_bytes=int(recording.info()["bytes"]),
         arms={
-            name: ArmLedger(
+            name: ArmAccount(
                 delivered=arm.delivered,
                 preroll=arm.preroll,
                 discarded=arm.discarded,

@@ -9,6 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
+import matplotlib as mpl
 import numpy as np
 
 from acquire.calibrate.apply import calibrated
@@ -18,7 +19,7 @@ from acquire.evaluate.curves import HARMONICS, SineFit, fit_constant, fit_sine, 
 from acquire.evaluate.paper.comparison import Row, frequency, same, statement
 from acquire.evaluate.paper.drawing import strip
 from acquire.evaluate.paper.studio import PaperFigure, Picture
-from acquire.evaluate.themed import SOLVER_COLOURS, THEORY, canvas
+from acquire.evaluate.themed import SOLVER_COLOURS, STYLE, THEORY, canvas
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -51,6 +52,7 @@ class Lamp:
     name: str | None
 
 
+@mpl.rc_context(STYLE)
 def figure_of(recording: Recording, studio: Studio, first_line: int | None = None) -> PaperFigure:
     """Make Fig. 9 from 263 lines of the recording, corrected by the calibration that it carries.
 

@@ -13,6 +13,7 @@ import tempfile
 from pathlib import Path
 
 from acquire.errors import DeviceError
+from acquire.place import home
 from acquire.sim.gentl.layout import header
 from acquire.store.refusals import refused
 
@@ -55,7 +56,7 @@ def build() -> Path:
     # The name covers everything that the result depends on, so that versions do not overwrite each other.
     digest = hashlib.sha256("\0".join((SOURCE.read_text(), header(), found, *OPTIONS)).encode()).hexdigest()
     base = os.environ.get("XDG_CACHE_HOME")
-    cache = (Path(base) if base else Path.home() / ".cache") / "tdi-acquire"
+    cache = (Path(base) if base else home() / ".cache") / "tdi-acquire"
     target = cache / f"acquire-simulated-{digest[:16]}.cti"
     if not target.is_file():
         with refused(target.parent, "written", hint=CACHE_HINT):

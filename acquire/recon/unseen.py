@@ -81,6 +81,17 @@ def find_unseen(segment: Segment, temporal_merge: int) -> list[Unseen]:
     return found
 
 
+def trusted_frames(segment: Segment, temporal_merge: int) -> tuple[slice, tuple[str, ...]]:
+    """Return the longest run of frames that both arms saw in full, and a warning for each range of others."""
+    T_m, origin = temporal_merge, segment.geometry.substeps * segment.first_line
+    sampled = segment.geometry.trusted_frames(T_m)
+    whole = (origin + T_m * sampled.start, origin + T_m * sampled.stop)
+    unseen = within(find_unseen(segment, T_m), *whole)
+    first, stop = ((edge - origin) // T_m for edge in longest(remaining(whole, unseen), whole[0]))
+    words = [each.words((each.begin - origin) // T_m, -(-(each.end - origin) // T_m) - 1) for each in unseen]
+    return slice(first, stop), tuple(words)
+
+
 def within(unseen: Iterable[Unseen], begin: int, end: int) -> list[Unseen]:
     """Return what lies in ``begin`` to ``end``; ranges of one arm that meet become one."""
     joined: list[Unseen] = []
