@@ -23,7 +23,7 @@ from acquire.errors import (
     StateError,
     UsageError,
 )
-from acquire.text import shortened, visible
+from acquire.text import visible
 
 
 def on_the_wire(text: object) -> str:
@@ -141,9 +141,6 @@ class StartRequest(Message):
             raise ValueError("resume needs the path of the recording to continue")
         if self.path is not None and not self.path.is_absolute():
             raise ValueError(f"path {str(self.path)!r} is not absolute: the daemon has another directory")
-        if self.path is not None and self.path.suffix != ".zarr" and not self.resume:
-            possible = f"{shortened(self.path.name, 60)}.zarr, since lists show only names that end like this"
-            raise ValueError(f"path ends in {shortened(self.path.name, 60)!r}; possible: {possible}")
         return self
 
     @field_validator("path")

@@ -162,14 +162,6 @@ def test_names_that_no_file_system_takes_are_refused(
     assert run.names == ["arm"]
 
 
-def test_a_name_that_no_list_would_show_is_refused(daemon: Client, run: FakeRun, tmp_path: Path) -> None:
-    """It was recorded, and then neither `ls` nor the page had it."""
-    daemon.arm()
-    with pytest.raises(UsageError, match=r"ends in 'run.1'; possible: run.1.zarr"):
-        daemon.start(tmp_path / "run.1")
-    assert run.names == ["arm"]
-
-
 def test_status_is_answered_while_arming(daemon: Client, run: FakeRun) -> None:
     run.may_arm.clear()
     arming = threading.Thread(target=daemon.arm)

@@ -16,7 +16,8 @@ from acquire.daemon.messages import Status
 from acquire.daemon.states import State
 from acquire.store import open_recording, verify
 
-RESERVE = 6_000_000
+RESERVE = 12_000_000
+"""More than a busy host writes between two looks at the disk."""
 ENDLESS = ("recording.retention.segment_lines=500", "recording.shard_chunks=4")
 
 pytestmark = pytest.mark.needs_mount
