@@ -107,7 +107,7 @@ def test_a_full_queue_of_readers_asks_to_come_again(tmp_path: Path, monkeypatch:
     """It was answered as if the request were wrong (422)."""
     monkeypatch.setattr(app_module, "MOST_READING", 2)
 
-    reading, page = app_module.Reading(), new_app("a list that waits for the disk")
+    reading, page = app_module.DiskReads(), new_app("a list that waits for the disk")
 
     @page.get("/list")
     async def _() -> list[str]:
