@@ -45,7 +45,8 @@ class Candidate:
     ``ground`` is the weight of a still ground behind a volume, relative to that of the volume; 0 is none.
     ``brightness``: times a free brightness of the whole scene; ``change``: the difference from the best
     still; ``fine``: solved at N_m = 1, then merged; ``robust``: samples with large residuals have less
-    weight. ``drift`` is the velocity of a volume's contents, see `VolumeTv`; () is none.
+    weight. ``drift`` is the velocity of a volume's contents and ``rotation`` their turn, see `VolumeTv`;
+    () is none.
     """
 
     prior: Literal["still", "smooth", "volume", "cycle"]
@@ -60,6 +61,7 @@ class Candidate:
     period_frames: float = 0.0
     speed_changes: tuple[float, ...] = ()
     drift: tuple[float, ...] = ()
+    rotation: tuple[float, ...] = ()
 
     def denoiser(self) -> Denoiser:
         """The denoiser of this prior."""
@@ -69,8 +71,8 @@ class Candidate:
             return Smooth(self.pace)
         cyclic = self.prior == "cycle"
         if self.ground:
-            return GroundedTv(self.pace, self.ground, cyclic=cyclic, drift=self.drift)
-        return VolumeTv(self.pace, cyclic=cyclic, drift=self.drift)
+            return GroundedTv(self.pace, self.ground, cyclic=cyclic, drift=self.drift, rotation=self.rotation)
+        return VolumeTv(self.pace, cyclic=cyclic, drift=self.drift, rotation=self.rotation)
 
     def basis(self, frames: int, arrays: Arrays) -> TemporalBasis | CyclicBasis:
         """The temporal basis of its coefficients."""

@@ -34,7 +34,7 @@ from acquire.recon.blinking import (
     refine,
     solve_in_cosines,
 )
-from acquire.recon.candidates import CALM, COSINES, GROUNDED, SMOOTH, STILL, VOLUME
+from acquire.recon.candidates import CALM, COSINES, GROUND, GROUNDED, SMOOTH, STILL, VOLUME
 from acquire.recon.cycle import TRIED_CHANGES, find_period
 from acquire.recon.drift import drift_of
 from acquire.recon.estimates import Preferred, Refined
@@ -42,6 +42,7 @@ from acquire.recon.given import Given
 from acquire.recon.holdout import HeldOut
 from acquire.recon.patterns import find_patterns, has_clear_patterns
 from acquire.recon.reuse import reuse_choice
+from acquire.recon.rotation import rotation_of
 from acquire.recon.solver import Preset, Solver
 from acquire.recon.still import best_still, change_bench, weighted_like
 from acquire.recon.workbench import (
@@ -81,6 +82,9 @@ REPEATS = 0.8
 """Largest error of a cycle, relative to the volume's, the still's and the cosines' at a glance, for which it
 is a candidate: a video that repeats itself claims more than any other. Motion that repeats has 0.4 to 0.7,
 text that scrolls 0.9."""
+TURNING = 0.95
+"""Largest error of a volume or cycle that turns, relative to that of one at rest, for which it is preferred:
+wheels, discs and fans have 0.5 to 0.85, and a splash that was taken for something that drifts 0.97."""
 CLOSE, NOT_FAR = 1.1, 2.0
 """Largest error of the cosines, relative to the best trial's, for which they are continued, and for which
 they are if clear patterns were found, or if only a glance was taken."""
@@ -209,7 +213,7 @@ def _search(bench: Workbench, tried: _Tried, trials: int, rival: float) -> Trial
     smooth = tried.smooth or bench.attempt(bench.fitting(SMOOTH), FIRST_ITERATIONS)
     grounded = bench.attempt(bench.fitting(GROUNDED), FIRST_ITERATIONS)
     volume = _or_drifting(min(tried.volume, calm, grounded, key=_error), rival)
-    volume = min(volume, tried.cycle or volume, key=_error)
+    volume = _or_turning(min(volume, tried.cycle or volume, key=_error), rival)
     bright = tried.bright
     # To a brightness, a flash in front of a still is the flash of everything.
     flickers = bright is not None and bench.held_out.clearly_less(bright.errors, plain.errors)
@@ -222,15 +226,18 @@ def _search(bench: Workbench, tried: _Tried, trials: int, rival: float) -> Trial
         still = best_still(plain, trials, merge=merge) if explains else bench.climb(plain, trials)
         if not bench.clock.spent(SEARCH_SHARE):
             like = weighted_like(still, bench.fitting(VOLUME))
-            candidate = replace(like, change=True, drift=volume.candidate.drift)
+            chosen = volume.candidate
+            # A cycle's turn is that of one cycle, and the change is a volume.
+            rotation = () if chosen.period_frames else chosen.rotation
+            candidate = replace(like, change=True, drift=chosen.drift, rotation=rotation)
             change = change_bench(bench, still).attempt(candidate, FIRST_ITERATIONS)
             volume = min((volume, change), key=_error)
     if volume.error < FAR * rival:
         volume = volume.bench.climb(volume, trials)
         if volume.candidate.brightness:
             volume = volume.bench.follow_brightness(volume)
-        if volume.candidate.drift:
-            volume = volume.bench.follow_drift(volume)
+        if volume.candidate.drift or volume.candidate.rotation:
+            volume = volume.bench.follow_path(volume)
         if volume.candidate.period_frames:
             volume = volume.bench.follow_speed(volume)
     if smooth.error < FAR * min(volume.error, rival):
@@ -251,14 +258,37 @@ def _or_drifting(volume: Trial, rival: float) -> Trial:
     if not drift or bench.clock.spent(SEARCH_SHARE):
         return volume
     found = bench.probe(replace(volume.candidate, drift=drift), min(volume.error, rival))
-    # A picture of n′ pixels that moves by v sides turns its finest wave v·n′/2 times, which takes v·n′
-    # cosines. With fewer, a search finds calmer volumes better, and never arrives there.
-    finest = max(map(abs, drift)) * found.admm.theta.shape[1]
+    return min(volume, _wide_enough(found, max(map(abs, drift))), key=_error)
+
+
+def _or_turning(volume: Trial, rival: float) -> Trial:
+    """The volume or cycle, or the same that follows what turns in it, if that predicts better."""
+    bench, rotation = volume.bench, rotation_of(volume)
+    if not rotation or bench.clock.spent(SEARCH_SHARE):
+        return volume
+    # With and without a ground from zero: a step from one to the other hardly arrives there.
+    found = volume
+    for ground in (0.0, GROUND):
+        turning = replace(volume.candidate, drift=(), rotation=rotation, ground=ground)
+        found = min(found, bench.probe(turning, min(found.error, rival)), key=_error)
+    if found is not volume and not found.candidate.period_frames:
+        # The rim of a picture whose sides are 1 moves by π turns.
+        found = _wide_enough(found, np.pi * abs(rotation[0]))
+    return found if found.error < TURNING * volume.error else volume
+
+
+def _wide_enough(found: Trial, sides: float) -> Trial:
+    """A trial, or one of as many cosines as contents take that move by so many sides, if that is better.
+
+    A picture of n′ pixels that moves by v sides turns its finest wave v·n′/2 times, which takes v·n′ cosines.
+    With fewer, a search finds calmer volumes better, and never arrives there.
+    """
+    bench, finest = found.bench, sides * found.admm.theta.shape[1]
     count = min(next((each for each in COSINES if each >= finest), COSINES[-1]), bench.frames)
-    if count > found.candidate.coefficients and not bench.clock.spent(SEARCH_SHARE):
-        wide = bench.attempt(replace(found.candidate, coefficients=count), NEXT_ITERATIONS, found)
-        found = min(found, wide, key=_error)
-    return min(volume, found, key=_error)
+    if count <= found.candidate.coefficients or bench.clock.spent(SEARCH_SHARE):
+        return found
+    wide = bench.attempt(replace(found.candidate, coefficients=count), NEXT_ITERATIONS, found)
+    return min(found, wide, key=_error)
 
 
 def _worth_refining(bench: Workbench, cosines: InBand, best: Trial) -> bool:

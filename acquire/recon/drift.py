@@ -32,7 +32,10 @@ FASTEST = 1.5
 """Largest velocity that is looked for, in sides of the picture over the range."""
 COHERENT = 0.3
 """Share of the changing light that has to add up at one velocity for a trial, which takes a second: bodies
-that cross the field and text have 0.35 to 0.8, what deforms or turns 0.1 to 0.28, and lamps 0.1."""
+that cross the field and text have 0.35 to 0.8, what deforms or turns 0.1 to 0.28, and lamps 0.1. With what
+the mean over time holds, what deforms slowly has as much as bodies, and its velocity is none."""
+LEAST_LEFT = 0.1
+"""Smallest share of a wave that its mean over time leaves, for which what is left counts in full."""
 ROUNDING = 1e-9
 """Share of a video's energy below which its changes are rounding."""
 
@@ -56,19 +59,28 @@ def find_drift(instants: NDArray[Any]) -> tuple[float, float] | None:
     changes = instants - instants.mean(axis=0)
     if np.square(changes).sum() <= ROUNDING * np.square(instants).sum():
         return None
-    f = np.fft.fftfreq(side, 1 / side)
-    kept = np.flatnonzero(abs(f) <= WAVES)
-    waves = np.fft.fft2(changes)[:, kept[:, None], kept]
-    total = max(count * float(np.square(abs(waves)).sum()), np.finfo(np.float64).tiny)
+    # Half of a real picture's waves are the other half's conjugates.
+    f, g = np.fft.fftfreq(side, 1 / side), np.fft.rfftfreq(side, 1 / side)
+    down, across = np.flatnonzero(abs(f) <= WAVES), np.flatnonzero(g <= WAVES)
+    twice = np.where(across > 0, 2.0, 1.0)  # so that these count for both
+    waves = np.fft.rfft2(changes)[:, down[:, None], across]
+    total = max(count * float((np.square(abs(waves)) * twice).sum()), np.finfo(np.float64).tiny)
     t = (np.arange(count) + 0.5) / count - 0.5
     v = np.arange(-FASTEST, FASTEST + 1e-9, 1 / (2 * WAVES))
-    turns = np.exp(2j * np.pi * t[:, None, None] * v[:, None] * f[kept])  # (instant, velocity, wave)
-    coherent = np.empty((len(v), len(v)))
+    turns = 2j * np.pi * t[:, None, None] * v[:, None]  # (instant, velocity, wave)
+    by_rows, by_columns = np.exp(turns * f[down]), np.exp(turns * g[across]).transpose(2, 1, 0)
+    shares, coherent = np.empty((2, len(v), len(v)))
     for row in range(len(v)):
-        added = np.einsum("kab,kvb->vab", waves * turns[:, row, :, None], turns, optimize=True)
-        coherent[row] = np.square(abs(added)).sum(axis=(1, 2)) / total
+        back = by_rows[:, row]
+        added = by_columns @ (waves * back[:, :, None]).transpose(2, 0, 1)  # (wave, velocity, wave)
+        power = np.square(abs(added))
+        shares[row] = power.sum(axis=2).T @ twice / total
+        # The mean over time, which is subtracted, holds a part of a wave that turns slowly. Without it, the
+        # peak is at too fast a velocity.
+        left = np.maximum(1 - np.square(abs(by_columns @ back / count)), LEAST_LEFT)
+        coherent[row] = (power / left).sum(axis=2).T @ twice / total
     peak = np.unravel_index(int(coherent.argmax()), coherent.shape)
-    if coherent[peak] < COHERENT:
+    if shares[peak] < COHERENT:
         return None
     rows, columns = coherent[:, peak[1]], coherent[peak[0]]
     return _refined(v, rows, int(peak[0])), _refined(v, columns, int(peak[1]))

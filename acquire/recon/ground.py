@@ -6,7 +6,7 @@ Total variation of a volume counts the edges of a still texture once at every in
 coefficient, so that a weight that holds back the noise of what moves erases the ground behind it. Here it is
 moved to G, of which every line shows all. Nothing has to be known of the ground: it is part of the minimum
 (an infimal convolution; Chambolle and Lions, Numer. Math. 76, 167 (1997)). The ground is at rest, even if
-the volume drifts.
+the volume drifts or turns.
 """
 
 from __future__ import annotations
@@ -32,9 +32,15 @@ class GroundedTv(VolumeTv):
     """
 
     def __init__(
-        self, pace: float, ground: float, *, cyclic: bool = False, drift: tuple[float, ...] = ()
+        self,
+        pace: float,
+        ground: float,
+        *,
+        cyclic: bool = False,
+        drift: tuple[float, ...] = (),
+        rotation: tuple[float, ...] = (),
     ) -> None:
-        super().__init__(pace, cyclic=cyclic, drift=drift)
+        super().__init__(pace, cyclic=cyclic, drift=drift, rotation=rotation)
         self.ground = ground
         self._still_tv = FrameTv(ITERATIONS)
         self._still: Array = None

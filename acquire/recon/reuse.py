@@ -38,8 +38,8 @@ class Choice:
 
     ``prior`` is that of a candidate, or `COSINES_PRIOR`, of which only the number is handed over.
     ``brightness`` is the number of cosines of the whole scene's brightness, 0 if that is constant,
-    ``period_frames`` that of a cycle and ``drift`` a volume's velocity in sides of the picture per frame,
-    which the next part fits to its own lines.
+    ``period_frames`` that of a cycle, ``drift`` a volume's velocity in sides of the picture per frame, and
+    ``rotation`` a cycle's turn, or a volume's with its turns per frame; the next part fits them to its lines.
     """
 
     prior: str
@@ -53,6 +53,7 @@ class Choice:
     period_frames: float = 0.0
     ground: float = 0.0
     drift: tuple[float, ...] = ()
+    rotation: tuple[float, ...] = ()
 
     @classmethod
     def of(cls, result: Reconstruction) -> Self | None:
@@ -65,6 +66,7 @@ class Choice:
             each["temporal_coefficients"] for each in found["candidates"] if each["prior"] == COSINES_PRIOR
         ]
         in_cosines, cyclic = found["prior"] == COSINES_PRIOR, "harmonics" in found
+        per_frame = 1.0 if cyclic else 1 / len(result.video)
         return cls(
             prior=found["prior"],
             # In a cycle, the cosines up to its fastest harmonic are not what is solved for.
@@ -78,6 +80,7 @@ class Choice:
             period_frames=found.get("period_frames", 0.0),
             ground=found.get("ground", 0.0),
             drift=tuple(each / len(result.video) for each in found.get("drift", ())),
+            rotation=_times_turns(per_frame, found.get("rotation", ())),
         )
 
     def fits(self, error: float, noise: float) -> bool:
@@ -104,8 +107,18 @@ class Choice:
         cosines = min(self.coefficients, frames)
         bright, fine = bool(self.brightness), self.fine
         drift = tuple(each * frames for each in self.drift)
-        known = {"brightness": bright, "fine": fine, "period_frames": self.period_frames, "drift": drift}
+        known = {
+            "brightness": bright,
+            "fine": fine,
+            "period_frames": self.period_frames,
+            "drift": drift,
+            "rotation": _times_turns(1.0 if self.period_frames else frames, self.rotation),
+        }
         return Candidate(self.prior, cosines, self.weight, self.pace, self.ground, **known)  # type: ignore[arg-type]  # not cosines
+
+
+def _times_turns(factor: float, rotation: tuple[float, ...]) -> tuple[float, ...]:
+    return (factor * rotation[0], *rotation[1:]) if rotation else ()
 
 
 def reuse_choice(bench: Workbench, trials: int) -> Estimate | None:
@@ -134,8 +147,8 @@ def reuse_choice(bench: Workbench, trials: int) -> Estimate | None:
         if bright is None or not bright.error < still.error:
             return None
     moving = bench.attempt(choice.candidate(frames), FIRST_ITERATIONS, bright)
-    if choice.drift:
-        moving = bench.follow_drift(moving)
+    if choice.drift or choice.rotation:
+        moving = bench.follow_path(moving)
     if choice.period_frames:
         # What was handed over had more iterations.
         moving = bench.follow_speed(moving)

@@ -6,7 +6,7 @@ over as many instants as there are cosines. An edge that moves is one surface in
 than one at rest, although all its coefficients are large; light that blinks in place costs twice its contrast
 in every period. So it suits moving objects, and coefficient frames (`tv.FrameTv`) suit those that blink.
 ``pace`` is μ: the higher it is, the less a scene may change. Of motion that repeats, the volume is one cycle,
-whose end meets its beginning. What drifts across the picture can be followed (`drift`).
+whose end meets its beginning. What drifts across the picture (`drift`) or turns (`rotation`) can be followed.
 """
 
 from __future__ import annotations
@@ -22,6 +22,7 @@ from acquire.errors import UsageError
 from acquire.recon.basis import CyclicBasis, TemporalBasis
 from acquire.recon.drift import Path
 from acquire.recon.kernels import SMALLEST_WEIGHT, volume_prox, volume_prox_parallel
+from acquire.recon.rotation import Rotation
 from acquire.recon.tv import ahead, layer
 
 if TYPE_CHECKING:
@@ -36,7 +37,7 @@ class VolumeTv:
 
     If it is ``cyclic``, the coefficients are those of a `CyclicBasis`, and the instants those of one cycle.
     ``drift`` is the velocity (rows, columns) of the volume's contents in sides of the picture over all
-    instants, along which changes are counted; () is none.
+    instants, and ``rotation`` their turn, see `Rotation`, along which changes are counted; () is none.
     The transform between coefficients and instants is orthonormal, so that the prox of one is the prox of the
     other. ``prox`` is approximate: ``iterations`` of fast gradient projection (Beck and Teboulle, IEEE
     Trans. Image Process. 18, 2419 (2009)) from where the last call ended.
@@ -49,6 +50,7 @@ class VolumeTv:
         *,
         cyclic: bool = False,
         drift: tuple[float, ...] = (),
+        rotation: tuple[float, ...] = (),
     ) -> None:
         if not 0 <= pace < math.inf:
             raise UsageError(
@@ -56,14 +58,15 @@ class VolumeTv:
             )
         if iterations < 1:
             raise UsageError(f"the TV prox cannot have {iterations} iterations", possible="1 or more")
-        self.pace, self.iterations, self.cyclic, self.drift = pace, iterations, cyclic, drift
+        self.pace, self.iterations, self.cyclic = pace, iterations, cyclic
+        self.drift, self.rotation = drift, rotation
         self._dual: Array = None
         self._instants: Array = None
-        self._path: Path | None = None
+        self._path: Path | Rotation | None = None
 
     def resume(self, other: VolumeTv) -> None:
-        """Start from the dual field of another, whatever its pace, unless only one of them drifts."""
-        if bool(self.drift) != bool(other.drift):
+        """Start from the dual field of another, whatever its pace, if it also drifts or turns, or neither."""
+        if (bool(self.drift), bool(self.rotation)) != (bool(other.drift), bool(other.rotation)):
             return
         self._instants = other._instants
         self._dual = None if other._dual is None else namespace(other._dual).asarray(other._dual, copy=True)
@@ -76,6 +79,8 @@ class VolumeTv:
         count = frames.shape[0]
         if self.drift and self._path is None:
             self._path = Path(self.drift, count, frames.shape[1], frames)
+        if self.rotation and self._path is None:
+            self._path = Rotation(self.rotation, count, frames.shape[1], frames)
         if self._dual is None:
             self._dual = xp.stack([xp.zeros_like(frames)] * 3)
             # It is computed in float64, so that frames of float64 do not get cosines that are rounded to

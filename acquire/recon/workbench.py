@@ -22,6 +22,7 @@ from acquire.recon.brightness import fit_brightness
 from acquire.recon.candidates import CALM, CYCLE, USUAL_ENERGY, VOLUME, Candidate, parameters
 from acquire.recon.cycle import FEWEST_HARMONICS, better_speed, most_harmonics
 from acquire.recon.drift import drift_of
+from acquire.recon.rotation import rotation_of
 from acquire.recon.volume import VolumeTv
 
 if TYPE_CHECKING:
@@ -255,13 +256,17 @@ class Workbench:
             stride, order = (1.0, order) if stride > 1 else (LONG_STRIDE, MOST_CHANGES)
         return best
 
-    def follow_drift(self, best: Trial) -> Trial:
-        """Find the velocity again, in the better video, as long as this improves the prediction."""
+    def follow_path(self, best: Trial) -> Trial:
+        """Find the velocity or the turn again in the better video, as long as the prediction improves."""
         for _ in range(SPEED_ROUNDS):
-            drift = drift_of(best)
-            if not drift or self.clock.spent(SEARCH_SHARE):
+            candidate = best.candidate
+            if candidate.rotation:
+                moved = replace(candidate, rotation=rotation_of(best))
+            else:
+                moved = replace(candidate, drift=drift_of(best))
+            if not (moved.rotation or moved.drift) or self.clock.spent(SEARCH_SHARE):
                 break
-            found = self.attempt(replace(best.candidate, drift=drift), NEXT_ITERATIONS, best)
+            found = self.attempt(moved, NEXT_ITERATIONS, best)
             gained = found.error < WORTH_A_ROUND * best.error
             best = min(best, found, key=lambda trial: trial.error)
             if not gained:

@@ -17,6 +17,7 @@
     fan       blades turn before a textured still
     string    a string vibrates, with an overtone
     piston    a crank moves a piston
+    wheel     a textured wheel turns beside the middle before textured ground
 
 Sizes are fractions of the picture and times fractions of the span, so that a scene is the same at any M, S
 and L_R; only the lamps have frequencies in sub-steps. The noise is that of a 12-bit camera whose brightest
@@ -33,7 +34,7 @@ import numpy as np
 from numpy.polynomial import Legendre
 from PIL import Image as Pil
 from PIL import ImageDraw, ImageFont
-from scipy.ndimage import gaussian_filter
+from scipy.ndimage import gaussian_filter, map_coordinates
 
 from acquire.codes import mix_seed, prbs
 from acquire.forward import DualArm, merge_video
@@ -328,6 +329,23 @@ def piston(s: Canvas) -> Callable[[int, float], Image]:
     return frame
 
 
+def wheel(s: Canvas) -> Callable[[int, float], Image]:
+    (y, x), radius = s.rng.uniform(0.4, 0.6, 2), s.rng.uniform(0.2, 0.35)
+    turns, start = s.rng.choice([-1, 1]) * s.rng.uniform(0.2, 0.9), s.rng.uniform(0, 2 * np.pi)
+    mask, face = s.ball(y, x, radius), (s.texture(0.02, 0.06) > 0.5).astype(np.float32)
+
+    def frame(_t: int, tau: float) -> Image:
+        angle = start + 2 * np.pi * turns * tau
+        dy, dx = s.y - y, s.x - x
+        rows = y + dy * np.cos(angle) - dx * np.sin(angle)
+        columns = x + dx * np.cos(angle) + dy * np.sin(angle)
+        at = [rows * s.n - 0.5, columns * s.n - 0.5]
+        painted = map_coordinates(face, at, order=1, mode="nearest")
+        return _over(0.6 * s.ground, mask, 0.1 + 0.9 * painted)
+
+    return frame
+
+
 SCENES = {
     f.__name__: f
     for f in (
@@ -348,6 +366,7 @@ SCENES = {
         fan,
         string,
         piston,
+        wheel,
     )
 }
 
