@@ -1,7 +1,7 @@
 """Compare the default with simple references, on scenes on which nothing was tuned, with a camera's noise.
 
     python tools/bench_trust.py [--scenes bullet splash …] [--seeds 21 22] [--full-well 1e4] [--twist]
-                                [--speed-changes 0.1 0.05]
+                                [--speed-changes 0.1 0.05] [--budget 10]
 
 One row per scene and seed (of code, scene and noise): PSNR of the trusted frames in voxels of 3 × 3, in dB,
 for
@@ -51,13 +51,15 @@ class Row:
     processor_s: float
 
 
-def measure(scene: str, seed: int, camera: Camera, speed_changes: list[float], *, twist: bool) -> Row:
+def measure(
+    scene: str, seed: int, camera: Camera, speed_changes: list[float], budget_s: float | None, *, twist: bool
+) -> Row:
     recorded = record(scene, seed, camera=camera, speed_changes=speed_changes)
     segment, truth = recorded.segment, recorded.truth(VOXEL, 1)
     still = reconstruct(segment, VOXEL, segment.geometry.span).video
     cosines = reconstruct(segment, VOXEL, 1, bandwidth=COSINES / segment.geometry.span)
     begun = time.process_time()
-    result = reconstruct(segment, VOXEL, 1)
+    result = reconstruct(segment, VOXEL, 1, budget_s=budget_s)
     processor_s = time.process_time() - begun
     by_twist = reconstruct(segment, VOXEL, 1, solver="twist") if twist else None
     return Row(
@@ -95,6 +97,7 @@ def main() -> None:
         default=[],
         help="coefficients of Legendre's polynomials P₁, P₂, … over the span, relative to the mean speed",
     )
+    parser.add_argument("--budget", type=float, metavar="SECONDS", help="time that the default may take")
     parser.add_argument("--twist", action="store_true", help="also run the paper's solver (minutes)")
     add_option(parser)
     options = parser.parse_args()
@@ -104,7 +107,7 @@ def main() -> None:
     with limit_threads(1), recorded("bench_trust", keep=options.record) as run:
         for scene in options.scenes:
             for seed in options.seeds:
-                row = measure(scene, seed, camera, options.speed_changes, twist=options.twist)
+                row = measure(scene, seed, camera, options.speed_changes, options.budget, twist=options.twist)
                 rows.append(row)
                 run.add(f"{scene}, seed {seed}", **figures(row))
                 yardsticks = f"{row.mean:5.1f}  {row.still:5.1f}  {row.cosines:7.1f}  {row.twist:5.1f}"

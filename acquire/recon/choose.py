@@ -83,8 +83,8 @@ REPEATS = 0.8
 is a candidate: a video that repeats itself claims more than any other. Motion that repeats has 0.4 to 0.7,
 text that scrolls 0.9."""
 TURNING = 0.95
-"""Largest error of a volume or cycle that turns, relative to that of one at rest, for which it is preferred:
-wheels, discs and fans have 0.5 to 0.85, and a splash that was taken for something that drifts 0.97."""
+"""Largest error of a volume that turns, relative to that of one at rest, for which it is preferred: wheels
+have 0.5 to 0.8, and a splash that was taken for something that drifts 0.97."""
 CLOSE, NOT_FAR = 1.1, 2.0
 """Largest error of the cosines, relative to the best trial's, for which they are continued, and for which
 they are if clear patterns were found, or if only a glance was taken."""
@@ -274,7 +274,9 @@ def _or_turning(volume: Trial, rival: float) -> Trial:
     if found is not volume and not found.candidate.period_frames:
         # The rim of a picture whose sides are 1 moves by π turns.
         found = _wide_enough(found, np.pi * abs(rotation[0]))
-    return found if found.error < TURNING * volume.error else volume
+    # A cycle at rest had many rounds to fit its speed, and needs no head start.
+    most = 1.0 if volume.candidate.period_frames else TURNING
+    return found if found.error < most * volume.error else volume
 
 
 def _wide_enough(found: Trial, sides: float) -> Trial:
