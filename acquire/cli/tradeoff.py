@@ -25,7 +25,7 @@ from acquire.errors import EXIT_INTERRUPTED, UsageError
 if TYPE_CHECKING:
     from acquire.evaluate.cases import Case
     from acquire.evaluate.host import HostWatch
-    from acquire.evaluate.tradeoff import Run
+    from acquire.evaluate.tradeoff import TradeoffRun
     from acquire.recon.segments import Voxels
     from acquire.reconstruct.learned import Learned
     from acquire.simulate import Study
@@ -187,12 +187,12 @@ def _measure(
     combinations: list[tuple[str, str, str]],
     longest_s: float,
     host: HostWatch,
-) -> tuple[list[Run], dict[tuple[str, Voxels], Any]]:
+) -> tuple[list[TradeoffRun], dict[tuple[str, Voxels], Any]]:
     """Measure every combination of solver, preset and dtype; return the runs and the true frames to show.
 
     Ctrl-C ends it with the runs made so far, which may have taken hours, if there are any.
     """
-    runs: list[Run] = []
+    runs: list[TradeoffRun] = []
     truths: dict[tuple[str, Voxels], Any] = {}
     try:
         _measure_into(runs, truths, cases, repeats, kinds, combinations, longest_s, host)
@@ -204,7 +204,7 @@ def _measure(
 
 
 def _measure_into(
-    runs: list[Run],
+    runs: list[TradeoffRun],
     truths: dict[tuple[str, Voxels], Any],
     cases: list[Case],
     repeats: int,
@@ -301,7 +301,7 @@ def _opened(source: str, out: Path, lines: int) -> tuple[Recording, Study | None
         return open_recording(place), study(bench_of(rig, scene), rig.code.build())
 
 
-def _lessons(runs: list[Run]) -> list[Learned]:
+def _lessons(runs: list[TradeoffRun]) -> list[Learned]:
     """Return the median results of each kind of run. Runs cut by the time limit do not judge their preset."""
     from acquire.evaluate.tradeoff_figures import in_series
     from acquire.reconstruct.learned import Learned
@@ -320,7 +320,7 @@ def _lessons(runs: list[Run]) -> list[Learned]:
     return lessons
 
 
-def _print(runs: list[Run]) -> None:
+def _print(runs: list[TradeoffRun]) -> None:
     """Print where each run ended, and sentences about the accuracy gained over time."""
     from acquire.evaluate.knees import sentences
     from acquire.evaluate.tradeoff_figures import in_series

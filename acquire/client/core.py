@@ -2,9 +2,9 @@
 
 ::
 
-    Client (blocking)  ─┐                        ┌─ a Unix socket: the daemon
-                        ├─ Call ▶ bytes ▶ answer ┤
-    AsyncClient        ─┘                        └─ http(s)://host:port, with a token: `acquire web`
+    Client (blocking)  ─┐                           ┌─ a Unix socket: the daemon
+                        ├─ ApiCall ▶ bytes ▶ answer ┤
+    AsyncClient        ─┘                           └─ http(s)://host:port, with a token: `acquire web`
 """
 
 from __future__ import annotations
@@ -138,7 +138,7 @@ def _no_address(text: str) -> UsageError:
 
 
 @dataclass(frozen=True, slots=True)
-class Call(Generic[T]):
+class ApiCall(Generic[T]):
     """One request, and the model of its answer."""
 
     method: str
@@ -179,14 +179,14 @@ class Call(Generic[T]):
             ) from error
 
 
-def fact(name: str, answer: type[T]) -> Call[T]:
+def fact(name: str, answer: type[T]) -> ApiCall[T]:
     """Return a call for information, which the daemon answers at once."""
-    return Call("GET", name, answer, timeout_s=STATUS_TIMEOUT_S)
+    return ApiCall("GET", name, answer, timeout_s=STATUS_TIMEOUT_S)
 
 
 def command(
     name: str, answer: type[T], body: BaseModel | None = None, request_id: str | None = None
-) -> Call[T]:
+) -> ApiCall[T]:
     """Return a command; it gets a request id unless the caller has one, so that it can be sent again.
 
     Raises UsageError for an id that no header can hold.
@@ -196,7 +196,7 @@ def command(
             f"{name}: request_id = {shown(request_id)} is not a request id",
             possible=f"1 to {LONGEST_ID} printable ASCII characters without spaces",
         )
-    return Call("POST", name, answer, body, request_id=request_id or secrets.token_hex(16))
+    return ApiCall("POST", name, answer, body, request_id=request_id or secrets.token_hex(16))
 
 
 def shows(options: type, model: type[BaseModel]) -> Callable[[Callable[P, Answer]], Callable[P, Answer]]:
@@ -215,18 +215,20 @@ def shows(options: type, model: type[BaseModel]) -> Callable[[Callable[P, Answer
     return decorate
 
 
-def arm(request_id: str | None, **options: Unpack[ArmOptions]) -> Call[Status]:
+def arm(request_id: str | None, **options: Unpack[ArmOptions]) -> ApiCall[Status]:
     return command("arm", Status, request("arm", ArmRequest, **options), request_id)
 
 
-def start(path: Path | str | None, request_id: str | None, **options: Unpack[StartOptions]) -> Call[Status]:
+def start(
+    path: Path | str | None, request_id: str | None, **options: Unpack[StartOptions]
+) -> ApiCall[Status]:
     """Return the command; a relative ``path`` is relative to the caller's directory."""
     # The daemon has another working directory. Anything else than a path is refused by the model.
     absolute = Path(path).absolute() if isinstance(path, str | os.PathLike) else path
     return command("start", Status, request("start", StartRequest, path=absolute, **options), request_id)
 
 
-def mark(text: str, request_id: str | None) -> Call[Status]:
+def mark(text: str, request_id: str | None) -> ApiCall[Status]:
     return command("mark", Status, request("mark", MarkRequest, text=text), request_id)
 
 

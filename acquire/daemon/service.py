@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 
     from acquire.config import RigConfig
     from acquire.daemon.messages import CapacityStatus, RecoveryStatus, StartRequest
-    from acquire.daemon.needs import OpenRun, Prove, Run
+    from acquire.daemon.needs import OpenRun, Prove, ServiceRun
     from acquire.stream.ring import RingShape
 
 RECOVERY_S = 20.0
@@ -78,7 +78,7 @@ class Service:
         self._state = State.IDLE
         self._since, self._since_s = datetime.now(UTC), time.monotonic()
         self._busy: str | None = None
-        self._run: Run | None = None
+        self._run: ServiceRun | None = None
         self._seen = CaptureStatus()
         self._rates = Rates()
         self._disk = disk_watch(config)

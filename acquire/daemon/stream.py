@@ -44,11 +44,11 @@ class Places:
     def __len__(self) -> int:
         return len(self._taken)
 
-    def take(self) -> Place:
-        return Place(self._taken)
+    def take(self) -> StreamPlace:
+        return StreamPlace(self._taken)
 
 
-class Place:
+class StreamPlace:
     """A place, also given back when its stream is dropped before its first step."""
 
     def __init__(self, taken: set[int]) -> None:
@@ -86,7 +86,9 @@ class Streams:
             last_id = self._log.last_id
         return self._stream(self._places.take(), last_id, status_s)
 
-    async def _stream(self, place: Place, last_id: str | None, status_s: float | None) -> AsyncIterator[str]:
+    async def _stream(
+        self, place: StreamPlace, last_id: str | None, status_s: float | None
+    ) -> AsyncIterator[str]:
         loop, woken = asyncio.get_running_loop(), asyncio.Event()
 
         def wake() -> None:

@@ -89,7 +89,7 @@ class Region:
 
 
 @dataclass(frozen=True, slots=True)
-class Stage:
+class TimedStep:
     """One step of the run and its duration."""
 
     name: str
@@ -170,7 +170,7 @@ class DemoResult:
     truth: NDArray[Any]
     solvers: tuple[SolverResult, ...]
     regions: tuple[Region, ...]
-    stages: tuple[Stage, ...]
+    stages: tuple[TimedStep, ...]
     host: Busyness
 
     def __post_init__(self) -> None:

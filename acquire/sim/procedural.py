@@ -54,7 +54,7 @@ SUBSTEP_HZ = 100e3
 
 
 @dataclass(frozen=True)
-class Camera:
+class CameraNoise:
     """Noise of EMVA 1288's linear model; the brightest sample is ``full_well_e`` electrons."""
 
     full_well_e: float = 1e4
@@ -68,7 +68,7 @@ class Camera:
         return Noise((K, K), (dark, dark))
 
 
-CLEAN = Camera(np.inf, 0.0)
+CLEAN = CameraNoise(np.inf, 0.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -375,7 +375,7 @@ def record(
     stages: int = 64,
     substeps: int = 3,
     lines: int = 263,
-    camera: Camera = Camera(),
+    camera: CameraNoise = CameraNoise(),
     speed_changes: Sequence[float] = (),
 ) -> Recorded:
     """Return the scene as recorded; ``seed`` determines scene, code and noise (`light` has the rest)."""
@@ -387,7 +387,7 @@ def record(
 
 
 def expose(
-    exact: NDArray[np.float64], geometry: Geometry, code: NDArray[np.uint8], camera: Camera, seed: int
+    exact: NDArray[np.float64], geometry: Geometry, code: NDArray[np.uint8], camera: CameraNoise, seed: int
 ) -> Segment:
     """Return Y of Eq. (1) as the 12-bit lines of a camera."""
     # Not `seed` alone, from which the scene was drawn: noise must not repeat those draws.

@@ -54,11 +54,11 @@ class ShutteredScene:
 def build_shutter(config: WindowConfig | ChopperConfig, size: int, substep_s: float) -> Shutter:
     """Return the shutter that a configuration describes."""
     if isinstance(config, WindowConfig):
-        return Window(config.phases, size, substep_s)
+        return PhasedWindow(config.phases, size, substep_s)
     return Chopper(config, size, substep_s)
 
 
-class Window:
+class PhasedWindow:
     """A sequence of phases in a loop that begins at sub-step 0."""
 
     def __init__(self, phases: tuple[WindowPhase, ...], size: int, substep_s: float) -> None:

@@ -45,7 +45,7 @@ _TRAILER = struct.Struct(">HHI")
 _IMAGE = 1
 
 
-class Status(IntEnum):
+class GvcpStatus(IntEnum):
     """Why a command was not carried out, in its answer."""
 
     DONE = 0
@@ -53,7 +53,7 @@ class Status(IntEnum):
     INVALID_ADDRESS = 0x8003
 
 
-class Command(IntEnum):
+class GvcpCommand(IntEnum):
     DISCOVERY = 0x0002
     RESEND = 0x0040
     READ_REGISTER = 0x0080
@@ -95,7 +95,7 @@ def parse_resend(request: Request) -> tuple[int, int, int] | None:
     return number, first & 0xFF_FFFF, last & 0xFF_FFFF
 
 
-def answer(request: Request, body: bytes, status: Status = Status.DONE) -> bytes:
+def answer(request: Request, body: bytes, status: GvcpStatus = GvcpStatus.DONE) -> bytes:
     # an acknowledge has the number after its command's
     return _ANSWER.pack(status, request.command + 1, len(body), request.number) + body
 
@@ -128,20 +128,20 @@ class Registers:
         """Carry out a command and return its answer; None if it is not supported."""
         try:
             match request.command:
-                case Command.DISCOVERY:
+                case GvcpCommand.DISCOVERY:
                     body = bytes(self.memory[:DISCOVERY_BYTES])
-                case Command.READ_REGISTER:
+                case GvcpCommand.READ_REGISTER:
                     (at,) = struct.unpack(">I", request.body[:4])
                     body = bytes(self.memory[self._place(at, 4)])
-                case Command.WRITE_REGISTER:
+                case GvcpCommand.WRITE_REGISTER:
                     at, value = struct.unpack(">II", request.body[:8])
                     self.memory[self._place(at, 4)] = struct.pack(">I", value)
                     # By the standard, the number of registers that were written.
                     body = struct.pack(">I", 1)
-                case Command.READ_MEMORY:
+                case GvcpCommand.READ_MEMORY:
                     at, count = struct.unpack(">IxxH", request.body[:8])
                     body = request.body[:4] + bytes(self.memory[self._place(at, count)])
-                case Command.WRITE_MEMORY:
+                case GvcpCommand.WRITE_MEMORY:
                     (at,) = struct.unpack(">I", request.body[:4])
                     data = request.body[4:]
                     self.memory[self._place(at, len(data))] = data
@@ -149,9 +149,9 @@ class Registers:
                 case _:
                     return None
         except IndexError:
-            return answer(request, b"", Status.INVALID_ADDRESS)
+            return answer(request, b"", GvcpStatus.INVALID_ADDRESS)
         except struct.error:  # a body that is too short for its command
-            return answer(request, b"", Status.INVALID_PARAMETER)
+            return answer(request, b"", GvcpStatus.INVALID_PARAMETER)
         return answer(request, body)
 
     def _place(self, at: int, count: int) -> slice:
@@ -162,7 +162,7 @@ class Registers:
 
 
 @dataclass(frozen=True, slots=True)
-class Frame:
+class GvspFrame:
     """One block of lines to send. ``number`` is never 0 and has 16 bits, or 64 in ``extended`` headers."""
 
     number: int
@@ -175,7 +175,7 @@ class Frame:
     offset: int = 0
 
 
-def packets(frame: Frame, packet_size: int) -> Iterator[bytes]:
+def packets(frame: GvspFrame, packet_size: int) -> Iterator[bytes]:
     """Yield leader, payload and trailer."""
     size = (_GVSP_EXTENDED if frame.extended else _GVSP).size
     # A host may write any size, also one of packets that hold nothing.
@@ -190,7 +190,7 @@ def packets(frame: Frame, packet_size: int) -> Iterator[bytes]:
     yield _header(frame, 2, count + 1) + _TRAILER.pack(0, _IMAGE, frame.height)
 
 
-def _header(frame: Frame, content: int, packet: int) -> bytes:
+def _header(frame: GvspFrame, content: int, packet: int) -> bytes:
     if frame.extended:
         return _GVSP_EXTENDED.pack(0, 0, _EXTENDED | content << 24, frame.number, packet)
     return _GVSP.pack(0, frame.number, content << 24 | packet)
