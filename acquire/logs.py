@@ -183,4 +183,6 @@ def write_log(level: int) -> None:
 
 
 def _entry(text: str) -> logging.LogRecord:
-    return logging.LogRecord("acquire.daemon", logging.WARNING, __file__, 0, text, None, None)
+    return logging.LogRecord(
+        "acquire.daemon", logging.WARNING, __file__, lineno=0, msg=text, args=None, exc_info=None
+    )

@@ -192,52 +192,38 @@ def _measure(
 
     Ctrl-C ends it with the runs made so far, which may have taken hours, if there are any.
     """
+    from acquire.evaluate.tradeoff import measure
+
     runs: list[TradeoffRun] = []
     truths: dict[tuple[str, Voxels], Any] = {}
     try:
-        _measure_into(runs, truths, cases, repeats, kinds, combinations, longest_s, host)
+        for case, repeat in itertools.product(cases, range(repeats)):
+            with activity_progress(f"preparing {case.name}"):
+                judge = case.judge(repeat)
+            for voxels, (solver, preset, dtype) in itertools.product(kinds, combinations):
+                # The page says how busy the host was, since that decides the times.
+                host.look()
+                what = f"{case.name}: {solver} {preset} {voxels}, {repeat + 1} of {repeats}"
+                with stage_progress(what) as advance:
+                    run = measure(
+                        judge,
+                        solver,
+                        voxels,
+                        preset=preset,  # type: ignore[arg-type]  # checked in `tradeoff`
+                        longest_s=longest_s,
+                        progress=advance,
+                        dtype=dtype,  # type: ignore[arg-type]  # checked in `tradeoff`
+                    )
+                runs.append(replace(run, case=case.name, repeat=repeat))
+                # The page shows frames of one repeat; a view of them would keep the whole truth in memory.
+                if repeat == 0:
+                    true = judge.truth(voxels)
+                    truths[case.name, voxels] = None if true is None else true[judge.picked(voxels)].copy()
     except KeyboardInterrupt:
         if not runs:
             raise
     host.look()
     return runs, truths
-
-
-def _measure_into(
-    runs: list[TradeoffRun],
-    truths: dict[tuple[str, Voxels], Any],
-    cases: list[Case],
-    repeats: int,
-    kinds: tuple[Voxels, ...],
-    combinations: list[tuple[str, str, str]],
-    longest_s: float,
-    host: HostWatch,
-) -> None:
-    """Add the runs, and the true frames of the first repeat, as they are made."""
-    from acquire.evaluate.tradeoff import measure
-
-    for case, repeat in itertools.product(cases, range(repeats)):
-        with activity_progress(f"preparing {case.name}"):
-            judge = case.judge(repeat)
-        for voxels, (solver, preset, dtype) in itertools.product(kinds, combinations):
-            # The page says how busy the host was, since that decides the times.
-            host.look()
-            what = f"{case.name}: {solver} {preset} {voxels}, {repeat + 1} of {repeats}"
-            with stage_progress(what) as advance:
-                run = measure(
-                    judge,
-                    solver,
-                    voxels,
-                    preset=preset,  # type: ignore[arg-type]  # checked in `tradeoff`
-                    longest_s=longest_s,
-                    progress=advance,
-                    dtype=dtype,  # type: ignore[arg-type]  # checked in `tradeoff`
-                )
-            runs.append(replace(run, case=case.name, repeat=repeat))
-            # The page shows frames of one repeat; a view of them would keep the whole truth in memory.
-            if repeat == 0:
-                true = judge.truth(voxels)
-                truths[case.name, voxels] = None if true is None else true[judge.picked(voxels)].copy()
 
 
 def _cases(

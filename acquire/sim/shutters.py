@@ -92,4 +92,11 @@ class Chopper:
     def cover(self, frames: NDArray[np.float32], substeps: NDArray[np.int64]) -> None:
         config = self._config
         turned = ((substeps + 0.5) * (config.rotation_hz * self._substep_s) + config.phase_deg / 360) % 1.0
-        chop(frames, self._angle, self._radius, turned, config.blades, config.open_part)
+        chop(
+            frames,
+            self._angle,
+            self._radius,
+            turned,
+            blades=config.blades,
+            open_part=config.open_part,
+        )
