@@ -106,6 +106,7 @@ class Bounded(logging.Filter):
         self._counts: dict[Kind, _Count] = {}
 
     def filter(self, record: logging.LogRecord) -> bool:
+        """Return whether to write the entry, and report what was suppressed in windows that are over."""
         now_s = self._now_s()
         for kind, count in list(self._counts.items()):
             if now_s - count.began_s < WINDOW_S and len(self._counts) < MOST_KINDS:
@@ -133,6 +134,7 @@ class Aside(logging.Handler):
         threading.Thread(target=self._write, name="log", daemon=True).start()
 
     def emit(self, record: logging.LogRecord) -> None:
+        """Hand the entry to the thread; if too many wait already, it is counted as lost."""
         if self._waiting.qsize() < MOST_WAITING:
             self._waiting.put(self.format(record))
         else:

@@ -121,6 +121,7 @@ class Target:
         return f"{'https' if self.tls else 'http'}://{self.host}:{self.port}"
 
     def path(self, below: str) -> str:
+        """Return the path of a request: the page has the API below a prefix, the daemon's socket has not."""
         return f"/{below}" if self.socket is not None else f"{API}/{below}"
 
     def headers(self) -> dict[str, str]:
@@ -150,6 +151,7 @@ class ApiCall(Generic[T]):
 
     @property
     def content(self) -> bytes | None:
+        """Return the body of the request as JSON; None for a request without one."""
         if self.body is None:
             return None
         # Without what is left at its default: a daemon from before an upgrade need not know options that
@@ -216,6 +218,7 @@ def shows(options: type, model: type[BaseModel]) -> Callable[[Callable[P, Answer
 
 
 def arm(request_id: str | None, **options: Unpack[ArmOptions]) -> ApiCall[Status]:
+    """Return the command. Raises UsageError for options that are not valid."""
     return command("arm", Status, request("arm", ArmRequest, **options), request_id)
 
 
@@ -229,6 +232,7 @@ def start(
 
 
 def mark(text: str, request_id: str | None) -> ApiCall[Status]:
+    """Return the command. Raises UsageError for a text that is not valid."""
     return command("mark", Status, request("mark", MarkRequest, text=text), request_id)
 
 
@@ -265,6 +269,7 @@ def states_of(states: Collection[State] | State) -> tuple[State, ...]:
 
 
 def events_path(target: Target, *, history: bool, status_s: float | None) -> str:
+    """Return the path of the stream of news, with a status every ``status_s`` unless that is None."""
     query: dict[str, Any] = {"history": "true"} if history else {}
     if status_s is not None:
         query["status_s"] = status_s
@@ -272,6 +277,7 @@ def events_path(target: Target, *, history: bool, status_s: float | None) -> str
 
 
 def events_headers(target: Target, last_id: str | None) -> dict[str, str]:
+    """Return the headers of a request for the stream, continued after the news with the id ``last_id``."""
     headers = {"Accept": "text/event-stream", **target.headers()}
     return headers | ({"Last-Event-ID": last_id} if last_id else {})
 

@@ -133,6 +133,7 @@ class Connection(H11Protocol):
         return cycle is not None and not cycle.more_body and not cycle.response_complete
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
+        """Limit the wait for the first request; if there are too many connections, close an idle one."""
         super().connection_made(transport)
         # From the first moment: a client that connects and sends nothing occupies a descriptor.
         self._wait(REQUEST_S)

@@ -68,6 +68,7 @@ class Rates:
 
 
 def seconds_since(monotonic_s: float) -> float:
+    """Return the time since a `time.monotonic`, rounded to milliseconds."""
     return round(time.monotonic() - monotonic_s, 3)
 
 

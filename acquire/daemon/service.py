@@ -111,6 +111,7 @@ class Service:
 
     @property
     def hurried(self) -> bool:
+        """Whether `hurry` was called."""
         return self._hurried.is_set()
 
     def hurry(self) -> None:

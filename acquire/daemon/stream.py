@@ -130,8 +130,10 @@ async def wait(woken: asyncio.Event, seconds: float) -> None:
 
 
 def news_text(news: News) -> str:
+    """Return news as an event of the stream, with the id from which a client can continue."""
     return f"id: {news.id}\nevent: news\ndata: {news.model_dump_json()}\n\n"
 
 
 def status_text(status: Status) -> str:
+    """Return a status as an event of the stream. It has no id: it is never sent again."""
     return f"event: status\ndata: {status.model_dump_json()}\n\n"

@@ -58,6 +58,7 @@ class ArmAccount:
 
     @property
     def lost_lines(self) -> int:
+        """Lines lost for any cause."""
         return sum(self.lost.values())
 
 
@@ -214,6 +215,7 @@ class DemoResult:
 
     @property
     def frame_interval_us(self) -> float:
+        """Mean time from one frame to the next."""
         return float(np.diff(self.frame_ms).mean()) * 1e3
 
     @property

@@ -59,6 +59,7 @@ DECIBELS = METRICS[0]
 
 
 def known(runs: Sequence[TradeoffRun], metric: Metric) -> bool:
+    """Return whether any run has a value of this metric; without a truth, none has."""
     return any(getattr(run.end, metric.name) is not None for run in runs)
 
 

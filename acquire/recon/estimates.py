@@ -97,6 +97,7 @@ class InBand:
         *,
         still: bool = False,  # noqa: ARG002 (the protocol's; nothing here is added to a still)
     ) -> InBand | None:
+        """Return the solver on another problem, from where this one is; None unless it is ADMM."""
         if not isinstance(self.solver, Admm):
             return None
         solver = self.solver.with_problem(problem.masked(self._operator), problem.used_samples, heavier)

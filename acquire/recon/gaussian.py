@@ -140,6 +140,7 @@ class Fit:
 
     @property
     def evidence(self) -> float:
+        """Log likelihood of all lines."""
         return float(self.blocks.sum())
 
 
@@ -157,6 +158,7 @@ class Model:
 
     @classmethod
     def of(cls, response: Response, prior: Prior, pixels: int) -> Model:
+        """Return the model for lines of ``pixels`` pixels, with the eigenvectors of both covariances."""
         covariance = response.covariance(prior)
         # A prior's noise is relative to the light, whose mean variance becomes 1.
         unit = max(float(np.trace(covariance)) / len(covariance), SMALLEST)
@@ -174,6 +176,7 @@ class Model:
         )
 
     def with_noise(self, noise: float) -> Model:
+        """Return the model with other noise, without decomposing the covariances again."""
         changed = replace(self, prior=replace(self.prior, noise=noise))
         changed.__dict__["_level"] = self._level  # modes do not depend on the noise
         return changed
@@ -192,6 +195,7 @@ class Model:
         return len(self._pixel_values)
 
     def modes(self, lines: Floats) -> Floats:
+        """Return lines (line, pixel) in the covariances' eigenvectors, in which samples are independent."""
         return np.asarray(self._vectors.T @ lines @ self._pixel_vectors)
 
     def fit(self, lines: Floats) -> Fit:

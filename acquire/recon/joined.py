@@ -35,13 +35,16 @@ class JoinedLayout:
 
     @property
     def shape(self) -> Shape:
+        """Shape of the joined array."""
         return (math.prod(self.volume) + math.prod(self.patterns),)
 
     def joined(self, volume: Array, patterns: Array) -> Array:
+        """Return both parts in one array; the opposite of `parts`."""
         xp = namespace(volume)
         return xp.concat([xp.reshape(self.scale * volume, (-1,)), xp.reshape(patterns, (-1,))])
 
     def parts(self, theta: Array) -> tuple[Array, Array]:
+        """Return volume and patterns of a joined array; the opposite of `joined`."""
         xp, size = namespace(theta), math.prod(self.volume)
         volume, patterns = xp.reshape(theta[:size], self.volume), xp.reshape(theta[size:], self.patterns)
         return volume / self.scale, patterns

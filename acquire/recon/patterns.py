@@ -270,6 +270,7 @@ class Refinement:
 
     @property
     def rank(self) -> int:
+        """Number of patterns."""
         return int(self.found.curves.shape[1])
 
     @property
@@ -279,6 +280,7 @@ class Refinement:
 
     @property
     def at_round_end(self) -> bool:
+        """Whether the latest iteration was the last one of a round, after which the curves are fitted."""
         return self._steps % ROUND == 0
 
     def step(self) -> None:

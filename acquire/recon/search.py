@@ -69,10 +69,12 @@ class WeighedHypothesis:
 
     @property
     def gain(self) -> float:
+        """Mutual evidence: what each arm's lines gain from the other's."""
         return float(self.evidence.mutual.sum())
 
     @property
     def total(self) -> float:
+        """Log likelihood: own and mutual evidence of all lines."""
         return float(self.evidence.total.sum())
 
     @property
@@ -202,6 +204,7 @@ class ByChance:
 
     @classmethod
     def of(cls, model: LineModel, plain: Hypothesis) -> ByChance:
+        """Try `RANDOM_CODES` random codes in place of the code; all else is as in ``plain``."""
         found = [
             _contrast(model, replace(plain, random_code=number)) for number in range(1, RANDOM_CODES + 1)
         ]

@@ -119,6 +119,7 @@ class Glimpses:
         )
 
     def reconstruct(self, segment: Segment) -> Reconstruction:
+        """Solve a segment in a fixed number of iterations, without checks and error estimate."""
         sizes = self._sizes
         return reconstruct(
             segment,
@@ -178,6 +179,7 @@ def glimpses(client: Client, is_over: Callable[[], bool]) -> Iterator[bytes]:
 
 
 def main() -> None:
+    """Write glimpses to standard output until standard input is closed, or its owner has ended."""
     os.nice(_NICE)
     over = threading.Event()
 

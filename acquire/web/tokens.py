@@ -42,9 +42,11 @@ class Tokens:
     viewer: str
 
     def role_of_token(self, token: str) -> Role | None:
+        """Return the role of a token; None for a wrong one."""
         return self._find(token, self._of)
 
     def role_of_cookie(self, cookie: str) -> Role | None:
+        """Return the role of a browser's cookie; None for a wrong one."""
         return self._find(cookie, self.cookie)
 
     def cookie(self, role: Role) -> str:

@@ -93,6 +93,7 @@ class Shot:
         return (first + np.arange(len(self.video))) * (self.segment.substep_ns * 1e-6)
 
     def numbers(self) -> dict[str, float]:
+        """Return PSNR in dB and SSIM against the truth."""
         return {"psnr_db": psnr(self.video, self.truth), "ssim": ssim(self.video, self.truth)}
 
     def accuracy(self) -> Row:

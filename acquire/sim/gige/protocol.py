@@ -96,6 +96,7 @@ def parse_resend(request: Request) -> tuple[int, int, int] | None:
 
 
 def answer(request: Request, body: bytes, status: GvcpStatus = GvcpStatus.DONE) -> bytes:
+    """Return the acknowledge of a request."""
     # an acknowledge has the number after its command's
     return _ANSWER.pack(status, request.command + 1, len(body), request.number) + body
 
@@ -118,10 +119,12 @@ class Registers:
             self.set(at, value)
 
     def get(self, at: int) -> int:
+        """Return the 32-bit register at an address."""
         value: int = struct.unpack_from(">I", self.memory, at)[0]
         return value
 
     def set(self, at: int, value: int) -> None:
+        """Set the 32-bit register at an address."""
         struct.pack_into(">I", self.memory, at, value)
 
     def handle(self, request: Request) -> bytes | None:
