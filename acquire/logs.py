@@ -38,6 +38,7 @@ MOST_KINDS = 256
 MOST_CHARACTERS = 4000
 """Upper limit on the length of an entry."""
 MOST_TRACEBACK_LINES = 60
+"""Number of last lines of a traceback: they name the error and where it arose."""
 MOST_WAITING = 1000
 """Entries that wait to be written."""
 FLUSH_S = 1.0

@@ -54,6 +54,7 @@ LAST_S = 0.7
 """Time for open connections when the server ends: a stream has no end of its own, and half a request may stay
 incomplete. If uvicorn cancelled them after `GRACE_S`, they would be answered with 500."""
 MOST_DESCRIPTORS = 65536
+"""Number of descriptors that is asked for, where the host permits more or sets no limit."""
 
 log = logging.getLogger("acquire.daemon")
 

@@ -38,6 +38,7 @@ if TYPE_CHECKING:
 AGAIN_S = 5.0
 """Time between two attempts at a recording that another process holds."""
 MOST_TRIES = 6
+"""Number of attempts at a recording that another process holds."""
 MOST_LISTED = 32
 """Number of latest recordings in the status: more than one run can leave."""
 MOST_ODD = 8

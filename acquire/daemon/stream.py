@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from acquire.daemon.news import NewsLog
 
 ALIVE_S = 1.0
+"""Longest silence of a stream: clients take a longer one for the daemon's death."""
 ALIVE = ": alive\n\n"
 """Also sent after the news with which a stream begins: the client then knows that these were all."""
 MOST_STREAMS = 16

@@ -28,9 +28,11 @@ FINE, SLOW, FAST = 4, 16, 128
 """Numbers of cosines that are resolved in fine rows, in rows as wide as pixels, and in few rows: sharp edges
 at rest would look like a delay if they fell between blocks."""
 FAST_ROWS = 16
+"""Number of those few rows."""
 EVIDENCE_LINES = 24
 """Length of the blocks of lines in which evidence is counted; their spread gives its uncertainty."""
 SMALLEST = 1e-30
+"""Keeps quotients finite for lines that do not vary."""
 
 
 @dataclass(frozen=True, slots=True)

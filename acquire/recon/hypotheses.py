@@ -37,6 +37,7 @@ MOST_PIXELS = 64
 MOST_BLOCKS = 192
 """Largest number of row blocks; below it there is one for each fine row."""
 UNKNOWN_BIT = 0.5
+"""Mean of a code bit, in place of one that is not known."""
 
 
 @dataclass(frozen=True, slots=True)

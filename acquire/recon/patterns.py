@@ -39,6 +39,7 @@ if TYPE_CHECKING:
     from acquire.recon.problem import MaskedOperator, Operator, Problem
 
 LARGEST_RANK = 12
+"""Largest number of patterns; a scene that takes more is not one of patterns."""
 TAIL = 16
 """Index of the singular value that is taken as the error floor of the first reconstruction."""
 ABOVE_TAIL = 3.0

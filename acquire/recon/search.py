@@ -23,9 +23,11 @@ DELAYS = (0, 3, -3, 6, -6, 10, -10)
 """Delays in sub-steps to start from, equal for both arms: pictures agree a little when they are this far
 off."""
 FARTHEST_DELAY = 24
+"""Longest delay of an arm that is tried, in sub-steps."""
 RANDOM_CODES = 4
 """Number of random codes that show the agreement by chance."""
 LEAST_CONTRAST = 10.0
+"""Least contrast and gain that are attributed to chance: a few random codes may show too little of it."""
 VERIFIED_ALONE, VERIFIED, BEYOND = 4.0, 2.0, 3.0
 """Agreement of the arms at which a code is verified; the second is enough if the code also explains each
 arm's own lines better than random codes do, by the third in their standard deviations."""

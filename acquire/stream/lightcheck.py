@@ -49,6 +49,7 @@ _MOST_SATURATED = 0.5
 all 156 with shares up to 0.6 were verified, and 48 of the rest: others were called dark, inverted, shifted or
 of another code."""
 _NEVER_ZERO = 1e-12
+"""Keeps quotients finite where nothing varies."""
 
 
 class Verdict(StrEnum):

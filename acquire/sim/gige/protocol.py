@@ -17,8 +17,8 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-PORT = 3956
-KEY = 0x42
+PORT = 3956  # GVCP's, the protocol of commands
+KEY = 0x42  # first byte of every command
 IP_AND_UDP_BYTES = 20 + 8
 """Bytes of IP and UDP headers, which count towards the packet size that the host sets, as GVSP's own do."""
 
@@ -26,7 +26,7 @@ LEAST_PAYLOAD_BYTES = 64
 
 DEVICE_MODE, MAC, ADDRESS = 0x0004, 0x0008, 0x0024
 VENDOR, MODEL, FIRMWARE, SERIAL, XML_URL = 0x0048, 0x0068, 0x0088, 0x00D8, 0x0200
-DISCOVERY_BYTES = 0xF8
+DISCOVERY_BYTES = 0xF8  # the answer to DISCOVERY has the registers below this one
 STREAM_CHANNELS, CAPABILITY, HEARTBEAT_MS, TICK_HIGH, TICK_LOW = 0x0904, 0x0934, 0x0938, 0x093C, 0x0940
 PRIVILEGE, STREAM_PORT, PACKET_SIZE, STREAM_ADDRESS = 0x0A00, 0x0D00, 0x0D04, 0x0D18
 BOOTSTRAP_BYTES = 0x1_0000
@@ -36,13 +36,13 @@ _HEADER = struct.Struct(">BBHHH")
 _ANSWER = struct.Struct(">HHHH")
 _GVSP = struct.Struct(">HHI")
 _GVSP_EXTENDED = struct.Struct(">HHIQI")
-_EXTENDED = 0x8000_0000
+_EXTENDED = 0x8000_0000  # flag of a header whose frame id has 64 bits
 _EXTENDED_REQUEST = 0x10  # flag of a resend request whose frame id has 64 bits
-_RESENDS = 1 << 2
+_RESENDS = 1 << 2  # bit of CAPABILITY: lost packets can be requested again
 # reserved, payload type, time stamp, pixel format, width, height, offsets, padding of lines and of the frame
 _LEADER = struct.Struct(">HHQIIIIIHH")
 _TRAILER = struct.Struct(">HHI")
-_IMAGE = 1
+_IMAGE = 1  # payload type
 
 
 class GvcpStatus(IntEnum):
