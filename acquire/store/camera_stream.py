@@ -9,7 +9,7 @@ import numpy as np
 from acquire.showing import in_words
 from acquire.store.array_files import COLUMNS, ArmFiles
 from acquire.store.chunks import ChunkReader
-from acquire.store.stretch import StoredRows
+from acquire.store.stored_rows import StoredRows
 
 if TYPE_CHECKING:
     from collections.abc import Callable

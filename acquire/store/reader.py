@@ -39,7 +39,7 @@ if TYPE_CHECKING:
     from acquire.store.layout import Document
     from acquire.store.overview import Overview
     from acquire.store.source import Source
-    from acquire.store.stretch import StoredRows
+    from acquire.store.stored_rows import StoredRows
 
 CUT_COLUMNS = ("lines", "flags", "code", "code_index", "time")
 """Arrays from which a segment is cut."""
