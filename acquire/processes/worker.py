@@ -39,7 +39,7 @@ disk."""
 _LAST_WORD_S = 0.1
 """How long the exit code is waited for when a pipe has ended."""
 _LOOK_S = 0.1
-"""Interval at which an ending process is tested for having been stopped, which no message would tell."""
+"""Interval at which an ending process is checked for having been stopped by a signal."""
 
 
 class OwnerGone(Exception):  # noqa: N818 - an event, not an error: the child ends in order
