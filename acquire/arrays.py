@@ -44,6 +44,7 @@ class Arrays:
         return self.xp.asarray(given, dtype=getattr(self.xp, self.dtype), device=self.device)
 
     def zeros(self, shape: tuple[int, ...]) -> Array:
+        """Return zeros of this back end's dtype, on its device."""
         return self.xp.zeros(shape, dtype=getattr(self.xp, self.dtype), device=self.device)
 
     def indices(self, given: NDArray[np.int64]) -> Array:

@@ -25,6 +25,7 @@ from __future__ import annotations
 from typing import Any
 
 EXIT_INTERRUPTED = 130
+"""128 + SIGINT, as shells report a program that Ctrl-C has ended."""
 
 
 class AcquireError(Exception):

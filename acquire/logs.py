@@ -38,6 +38,7 @@ MOST_KINDS = 256
 MOST_CHARACTERS = 4000
 """Upper limit on the length of an entry."""
 MOST_TRACEBACK_LINES = 60
+"""Number of last lines of a traceback: they name the error and where it arose."""
 MOST_WAITING = 1000
 """Entries that wait to be written."""
 FLUSH_S = 1.0
@@ -106,6 +107,7 @@ class Bounded(logging.Filter):
         self._counts: dict[Kind, _Count] = {}
 
     def filter(self, record: logging.LogRecord) -> bool:
+        """Return whether to write the entry, and report what was suppressed in windows that are over."""
         now_s = self._now_s()
         for kind, count in list(self._counts.items()):
             if now_s - count.began_s < WINDOW_S and len(self._counts) < MOST_KINDS:
@@ -133,6 +135,7 @@ class Aside(logging.Handler):
         threading.Thread(target=self._write, name="log", daemon=True).start()
 
     def emit(self, record: logging.LogRecord) -> None:
+        """Hand the entry to the thread; if too many wait already, it is counted as lost."""
         if self._waiting.qsize() < MOST_WAITING:
             self._waiting.put(self.format(record))
         else:
@@ -183,4 +186,6 @@ def write_log(level: int) -> None:
 
 
 def _entry(text: str) -> logging.LogRecord:
-    return logging.LogRecord("acquire.daemon", logging.WARNING, __file__, 0, text, None, None)
+    return logging.LogRecord(
+        "acquire.daemon", logging.WARNING, __file__, lineno=0, msg=text, args=None, exc_info=None
+    )

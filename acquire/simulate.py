@@ -120,15 +120,6 @@ def layout_of(config: RigConfig, scene: SceneConfig) -> str:
     return scene.optics.layout if config.fibre is None else config.cameras.layout
 
 
-def _check_models(config: object, scene: object) -> None:
-    """Raise UsageError for the names of a rig and a scene in place of what they stand for."""
-    for given, kind, load in ((config, RigConfig, "load_rig"), (scene, SceneBase, "load_scene")):
-        if not isinstance(given, kind):
-            raise UsageError(
-                f"{shown(given)} cannot be simulated", possible=f"a {kind.__name__}", hint=f"{load}(...)"
-            )
-
-
 def simulate(
     config: RigConfig,
     scene: SceneConfig,
@@ -141,7 +132,12 @@ def simulate(
     Everything that can be refused is refused with a UsageError before ``path`` exists. A later failure or
     interruption leaves a sealed recording that states it.
     """
-    _check_models(config, scene)
+    # The names of a rig and a scene, in place of what they stand for, are the likely mistake.
+    for given, kind, load in ((config, RigConfig, "load_rig"), (scene, SceneBase, "load_scene")):
+        if not isinstance(given, kind):
+            raise UsageError(
+                f"{shown(given)} cannot be simulated", possible=f"a {kind.__name__}", hint=f"{load}(...)"
+            )
     path = path_of(path)
     check_integers(lines=lines)
     if not 1 <= lines <= MOST_SIMULATED_LINES:

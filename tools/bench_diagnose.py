@@ -30,7 +30,7 @@ from acquire.lines import Segment
 from acquire.recon.diagnosis import Diagnosis, diagnose
 from acquire.recon.hypotheses import Hypothesis, Turn
 from acquire.recon.search import Standing
-from acquire.sim.procedural import SCENES, Camera, record
+from acquire.sim.procedural import SCENES, CameraNoise, record
 from tools.results import Run, add_option, recorded
 
 DEGREE, AHEAD = 31, 64
@@ -86,7 +86,7 @@ def mark(found: Diagnosis, truth: Hypothesis | None) -> str:
     return "✓" if found.hypothesis == truth else "✗"
 
 
-def segment_of(name: str, seed: int, camera: Camera) -> tuple[Segment, np.ndarray]:
+def segment_of(name: str, seed: int, camera: CameraNoise) -> tuple[Segment, np.ndarray]:
     """A segment, and the code's bits from `AHEAD` before it on."""
     segment = record(name, seed, camera=camera).segment
     later = prbs(DEGREE, mix_seed(seed, DEGREE), 0, 2 * segment.geometry.span)
@@ -96,7 +96,7 @@ def segment_of(name: str, seed: int, camera: Camera) -> tuple[Segment, np.ndarra
 
 
 def table(
-    scenes: list[str], seeds: list[int], camera: Camera, say: Callable[[str], object], run: Run
+    scenes: list[str], seeds: list[int], camera: CameraNoise, say: Callable[[str], object], run: Run
 ) -> None:
     total: dict[str, list[str]] = {}
     seconds = []
@@ -147,7 +147,7 @@ def main() -> None:
     parser.add_argument("--full-well", type=float, default=1e4, help="electrons of the brightest sample")
     add_option(parser)
     options = parser.parse_args()
-    camera = Camera(full_well_e=options.full_well)
+    camera = CameraNoise(full_well_e=options.full_well)
     with limit_threads(1), recorded("bench_diagnose", keep=options.record) as run:
         table(options.scenes, options.seeds, camera, lambda line: print(line, flush=True), run)
 

@@ -31,12 +31,12 @@ from acquire.recon import error as estimation
 from acquire.recon import reconstruct
 from acquire.recon.error import Exponents, Indicators, VideoError, error_from, in_regions
 from acquire.sim import procedural
-from acquire.sim.procedural import Camera, Recorded
+from acquire.sim.procedural import CameraNoise, Recorded
 from tools import error_scenes
 from tools.results import Run, add_option, recorded
 
 STAGES, SUBSTEPS, LINES = 32, 3, 160
-CAMERAS = {"1e4": Camera(), "1e3": Camera(1e3), "clean": procedural.CLEAN}
+CAMERAS = {"1e4": CameraNoise(), "1e3": CameraNoise(1e3), "clean": procedural.CLEAN}
 VOXELS = ((3, 1), (2, 8))
 Make = Callable[..., Recorded]
 RIDGE = 0.02

@@ -25,7 +25,7 @@ from acquire.cli.tiles import tiles_of
 from acquire.config import load_rig, load_scene
 from acquire.config.scene import SceneFile
 from acquire.recon.segments import Voxels
-from acquire.reconstruct import Options, Watcher, by_lines, combine, in_tiles, in_voxels, open_pool
+from acquire.reconstruct import Monitor, Options, by_lines, combine, in_tiles, in_voxels, open_pool
 from acquire.sim.procedural import Canvas, still
 from acquire.sim.scene import frames_at
 from acquire.sim.scenes import build_scene
@@ -105,12 +105,12 @@ def measure(options: argparse.Namespace, home: Path) -> None:
     voxels = Voxels(options.nm or (1 if resting else 4), options.tm or (span if resting else 16))
     request = in_tiles(in_voxels(by_lines(opened), voxels), tiles)
     tasks = len(request.stretches) * len(tiles)
-    watcher = Watcher(tasks, lambda done, of: print(f"{done:.1f} of {of}", end="\r", flush=True))
+    monitor = Monitor(tasks, lambda done, of: print(f"{done:.1f} of {of}", end="\r", flush=True))
     out = home / f"{options.what}-{options.seed}-{time.time_ns()}-video.zarr"
     began = time.monotonic()
-    with open_pool(tasks, options.workers, None, watcher) as pool:
+    with open_pool(tasks, options.workers, None, monitor) as pool:
         how = Options(options.preset, shared=options.search == "shared")
-        outcome = combine(opened, request, out, options=how, pool=pool, watcher=watcher)
+        outcome = combine(opened, request, out, options=how, pool=pool, monitor=monitor)
     seconds = time.monotonic() - began
     video, side = open_video(out), request.grid.side
     found = np.asarray(video.video[:])

@@ -17,7 +17,7 @@ from pathlib import Path
 
 from acquire.config import load_rig, load_scene
 from acquire.recon.segments import Voxels
-from acquire.reconstruct import Options, Watcher, by_lines, combine, in_voxels, open_pool
+from acquire.reconstruct import Monitor, Options, by_lines, combine, in_voxels, open_pool
 from acquire.simulate import simulate
 from acquire.store import open_recording
 from tools.results import add_option, recorded
@@ -28,10 +28,10 @@ def measure(path: Path, lines: int, iterations: int, answer: multiprocessing.que
     recording = open_recording(path)
     request = in_voxels(by_lines(recording, 0, lines), Voxels(3, 1))
     tasks = len(request.stretches)
-    watcher, began = Watcher(tasks), time.perf_counter()
-    with open_pool(tasks, watch=watcher) as pool:
+    monitor, began = Monitor(tasks), time.perf_counter()
+    with open_pool(tasks, watch=monitor) as pool:
         options, out = Options(iterations=iterations), path.with_name(f"{lines}.zarr")
-        combine(recording, request, out, options=options, pool=pool, watcher=watcher)
+        combine(recording, request, out, options=options, pool=pool, monitor=monitor)
     seconds = time.perf_counter() - began
     peaks = [
         resource.getrusage(who).ru_maxrss / 1024 for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)

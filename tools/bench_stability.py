@@ -17,7 +17,7 @@ import numpy as np
 from acquire.cores import limit_threads
 from acquire.evaluate.metrics import psnr
 from acquire.recon import reconstruct
-from acquire.sim.procedural import CLEAN, SCENES, Camera, record
+from acquire.sim.procedural import CLEAN, SCENES, CameraNoise, record
 from tools.results import add_option, recorded
 
 if TYPE_CHECKING:
@@ -48,7 +48,7 @@ def main() -> None:
     parser.add_argument("--versions", type=int, default=3)
     add_option(parser)
     options = parser.parse_args()
-    camera = Camera(options.full_well) if np.isfinite(options.full_well) else CLEAN
+    camera = CameraNoise(options.full_well) if np.isfinite(options.full_well) else CLEAN
     with limit_threads(1), recorded("bench_stability", keep=options.record) as run:
         for scene in options.scenes:
             for seed in options.seeds:

@@ -26,7 +26,7 @@ from acquire.evaluate.cases import full_wells
 from acquire.evaluate.metrics import psnr
 from acquire.recon import reconstruct
 from acquire.recon.segments import Voxels
-from acquire.sim.procedural import CLEAN, SCENES, Camera, record
+from acquire.sim.procedural import CLEAN, SCENES, CameraNoise, record
 from tools.results import add_option, recorded
 
 NOT_WORSE_DB = -0.1
@@ -50,7 +50,7 @@ class Row:
 
 
 def measure(scene: str, seed: int, full_well_e: float, voxels: Voxels, options: argparse.Namespace) -> Row:
-    camera = Camera(full_well_e) if np.isfinite(full_well_e) else CLEAN
+    camera = CameraNoise(full_well_e) if np.isfinite(full_well_e) else CLEAN
     whole = record(scene, seed, stages=options.stages, lines=options.lines, camera=camera)
     merges = voxels.spatial_merge, voxels.temporal_merge
     segment, truth = whole.segment, whole.truth(*merges)

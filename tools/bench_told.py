@@ -28,7 +28,7 @@ from acquire.geometry import Geometry
 from acquire.lines import Segment
 from acquire.recon import reconstruct
 from acquire.recon.balance import balance_of
-from acquire.sim.procedural import BLACK_DN, SCENES, Camera, expose, light, record
+from acquire.sim.procedural import BLACK_DN, SCENES, CameraNoise, expose, light, record
 from tools.results import Run, add_option, recorded
 
 RATIOS = (1.0, 1.02, 1.05, 1.1, 1.2)
@@ -76,7 +76,7 @@ def shifted(scene: str, seed: int, rows: int, columns: int) -> Segment:
     ]
     operator = DualArm(geometry, code)
     exact = [operator.forward(np.ascontiguousarray(view))[arm] for arm, view in enumerate(views)]
-    return expose(np.stack(exact).astype(np.float64), geometry, code, Camera(), seed)
+    return expose(np.stack(exact).astype(np.float64), geometry, code, CameraNoise(), seed)
 
 
 def field(run: Run, scenes: list[str], seeds: list[int]) -> None:

@@ -27,7 +27,7 @@ import numpy as np
 from acquire.cores import limit_threads
 from acquire.evaluate.metrics import psnr, ssim
 from acquire.recon import reconstruct
-from acquire.sim.procedural import CLEAN, SCENES, Camera, record
+from acquire.sim.procedural import CLEAN, SCENES, CameraNoise, record
 from tools.results import add_option, recorded
 
 VOXEL = 3
@@ -52,7 +52,13 @@ class Row:
 
 
 def measure(
-    scene: str, seed: int, camera: Camera, speed_changes: list[float], budget_s: float | None, *, twist: bool
+    scene: str,
+    seed: int,
+    camera: CameraNoise,
+    speed_changes: list[float],
+    budget_s: float | None,
+    *,
+    twist: bool,
 ) -> Row:
     recorded = record(scene, seed, camera=camera, speed_changes=speed_changes)
     segment, truth = recorded.segment, recorded.truth(VOXEL, 1)
@@ -101,7 +107,7 @@ def main() -> None:
     parser.add_argument("--twist", action="store_true", help="also run the paper's solver (minutes)")
     add_option(parser)
     options = parser.parse_args()
-    camera = Camera(options.full_well) if np.isfinite(options.full_well) else CLEAN
+    camera = CameraNoise(options.full_well) if np.isfinite(options.full_well) else CLEAN
     print("scene      mean  still  cosines  TwIST  default  SSIM  error   s   prior")
     rows = []
     with limit_threads(1), recorded("bench_trust", keep=options.record) as run:

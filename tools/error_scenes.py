@@ -28,7 +28,7 @@ from acquire.codes import mix_seed, prbs
 from acquire.config import load_scene
 from acquire.forward import DualArm
 from acquire.geometry import Geometry
-from acquire.sim.procedural import SUBSTEP_HZ, Camera, Canvas, Recorded, expose
+from acquire.sim.procedural import SUBSTEP_HZ, CameraNoise, Canvas, Recorded, expose
 from acquire.sim.scenes import build_scene
 from acquire.sim.voxels import truth
 
@@ -236,7 +236,7 @@ SCENES = (*OF_THE_PAPER, *OF_OUR_OWN)
 KEPT = {each.__name__: each for each in (swing, fan, ripples, smoke, typing, pulse, shadow, flashes)}
 
 
-def record(name: str, seed: int, *, stages: int, substeps: int, lines: int, camera: Camera) -> Recorded:
+def record(name: str, seed: int, *, stages: int, substeps: int, lines: int, camera: CameraNoise) -> Recorded:
     """As `acquire.sim.procedural.record`."""
     geometry = Geometry(stages, substeps, lines)
     code = prbs(31, mix_seed(seed, 31), 0, geometry.span)

@@ -10,9 +10,9 @@ from pathlib import Path
 
 import numpy as np
 
-from acquire.sim.procedural import CLEAN, SCENES, Camera, Canvas, Recorded, expose, light, record
+from acquire.sim.procedural import CLEAN, SCENES, CameraNoise, Canvas, Recorded, expose, light, record
 
-__all__ = ["CLEAN", "SCENES", "Camera", "Canvas", "Recorded", "expose", "light", "record"]
+__all__ = ["CLEAN", "SCENES", "CameraNoise", "Canvas", "Recorded", "expose", "light", "record"]
 
 
 def main() -> None:

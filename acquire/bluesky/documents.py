@@ -28,6 +28,7 @@ MIMETYPE = "application/x-zarr"
 
 
 def key_of(name: str, arm: str) -> str:
+    """Return the key of an arm in documents: ``NAME-a`` or ``NAME-b``."""
     return f"{name}-{arm}"
 
 
@@ -71,6 +72,7 @@ class Account:
 
     @property
     def now(self) -> RecordedRows:
+        """The segment that is being recorded, or was recorded last."""
         return self.segments[-1]
 
     @property

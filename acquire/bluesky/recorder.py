@@ -54,6 +54,7 @@ class Marker(Device, Movable[str]):
 
     @AsyncStatus.wrap
     async def set(self, value: str) -> None:
+        """Mark the newest line with this text, and finish when the daemon has accepted it."""
         await self._client.mark(value)
 
 

@@ -19,10 +19,13 @@ if TYPE_CHECKING:
 MOST_AT_ZERO = 1e-3
 """Share of a dark column's samples at 0 above which its mean is wrong."""
 MOST_SATURATED = 1e-3
+"""Share of saturated samples from which a flat's means are too low to be used."""
 DIMMEST, BRIGHTEST = 0.1, 0.9
 """Shares of the range below which a flat determines little, and above which noise may reach white."""
 DRIFT = 6.0
+"""Standard errors by which the columns' mean may drift without a warning."""
 LOWEST_LIGHT_DN = 8.0
+"""Least light above black in a flat, as the median of an arm's columns."""
 AMBIENT, BRIGHT_DARK = 0.05, 0.25
 """Parts of the range above the camera's black level at which dark lines are doubtful, and at which a lens
 that is said to be covered is not."""
@@ -33,6 +36,7 @@ TEXTURE, UNEVEN = 0.1, 0.06
 """Spread of a flat's columns about a smooth profile that no sensor has (1 to 3 % are usual), and the least
 range of that profile that is mentioned."""
 PROFILE_DEGREE = 4
+"""Degree of the smooth profile across the columns."""
 LEAST_COLUMNS = 16
 """Fewer columns do not tell texture from a profile."""
 

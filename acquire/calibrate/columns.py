@@ -46,6 +46,7 @@ DARK_EDGE = 4.0
 TOGETHER, LEAST_LACK = 3.0, 2e-3
 """Least deficit of the outermost columns together, in standard errors and relative to 1, that counts."""
 EDGE_SHARE = 0.125
+"""Share of the columns at each edge among which dark ones are looked for."""
 SMOOTH_DEGREE = 4
 
 

@@ -51,10 +51,12 @@ class DelayRange:
 
     @property
     def most_lead(self) -> int:
+        """Longest lead of the light in ticks: what the register holds and the sub-step leaves room for."""
         return min(MOST_LEAD, self.substep_ticks - GATEWARE.lead_margin_ticks)
 
     @property
     def most_delay(self) -> int:
+        """Longest delay of a camera's line start in ticks, with its pulse ending before the next begins."""
         return self.pulse_distance_ticks - pulse_width_ticks(None, self.pulse_distance_ticks) - 1
 
     def delays(self, later: Sequence[float]) -> Delays:
@@ -113,6 +115,7 @@ class Crossing:
 
 
 def setting_of(exposure: Exposure) -> DelayRange:
+    """Return the delays that were possible for the trigger of a recording, from its configuration."""
     config = exposure.recording.attrs["config"]
     trigger = config["trigger"]
     each = 1 if trigger["line_start"] == "per-substep" else config["geometry"]["substeps"]

@@ -31,6 +31,7 @@ BETTER = 0.25
 LEAST_LIGHT = 0.3
 """Least share of its light with which a column's gain is still computed."""
 PARABOLA = 2
+"""Degree of the smooth course that the columns' own differences may have."""
 CHANCE = 1e-3
 """Probability of taking the columns' own differences for a parabola."""
 BALANCE_ERROR = 5e-4

@@ -72,6 +72,7 @@ class Ramp:
 
     @property
     def level_dn(self) -> NDArray[np.float64]:
+        """(level,) mean over the columns, above black."""
         return np.asarray(self.light_dn.mean(axis=1))
 
     @property

@@ -42,6 +42,7 @@ pixels while 1024 lines are recorded has 0.4, by one 0.8; the shift is then wron
 COARSE = 8
 """Width of the target's detail, in fine pixels, from which an alignment is less certain than it says."""
 SAME_BALANCE = 0.002
+"""Difference of the arms' light up to which the flat's balance is kept."""
 BALANCE_ERROR = 0.001
 """Uncertainty of the ratio of the arms' light over the field that both see."""
 

@@ -148,10 +148,12 @@ class Words(logging.Handler):
 
     @property
     def last(self) -> str:
+        """The first line of the latest message; empty before the first one."""
         return self._last[-1] if self._last else ""
 
 
 def is_gone(error: Exception) -> bool:
+    """Return whether a GenTL error means that the device has been lost, and not that a call was wrong."""
     from genicam import gentl
 
     return isinstance(error, gentl.IoException | gentl.InvalidHandleException | gentl.ClosedException)

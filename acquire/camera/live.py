@@ -24,7 +24,7 @@ _END_S = 30.0
 
 
 @dataclass(frozen=True, slots=True)
-class View:
+class ImagePart:
     """Part of a camera's image: an arm's columns, black and white. None: all columns, the format's white."""
 
     columns: tuple[int, int] | None = None
@@ -46,7 +46,9 @@ class LiveCamera:
     A camera may have several views, for example one with both arms' images.
     """
 
-    def __init__(self, name: str, opener: CameraOpener, views: dict[str, View], timeout_s: float) -> None:
+    def __init__(
+        self, name: str, opener: CameraOpener, views: dict[str, ImagePart], timeout_s: float
+    ) -> None:
         """Wait until the camera waits for lines. Raises CameraError, or DeviceError after ``timeout_s``."""
         self._worker = Worker(name, _look, opener, views)
         try:
@@ -76,7 +78,7 @@ class LiveCamera:
         self._worker.end(time.monotonic() + _END_S)
 
 
-def _look(mailbox: Mailbox, opener: CameraOpener, views: dict[str, View]) -> None:
+def _look(mailbox: Mailbox, opener: CameraOpener, views: dict[str, ImagePart]) -> None:
     camera: Camera = opener()
     try:
         facts: dict[str, Any] = {"serial": camera.identify().serial, "settings": camera.settings()}
@@ -100,7 +102,7 @@ def _look(mailbox: Mailbox, opener: CameraOpener, views: dict[str, View]) -> Non
         camera.close()
 
 
-def _white(view: View, settings: dict[str, Any]) -> int:
+def _white(view: ImagePart, settings: dict[str, Any]) -> int:
     """Return the white of the view, or of the camera's pixel format; ``Mono12p`` is packed Mono12."""
     if view.white_dn is not None:
         return view.white_dn

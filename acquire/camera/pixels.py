@@ -39,6 +39,7 @@ class PixelLayout:
         return "uint8" if self.bits <= 8 else "uint16"
 
     def row_bytes(self, width: int) -> int:
+        """Return the bytes of a row; a last byte that is only partly used counts."""
         return -(-width * self.stored_bits // 8)
 
 

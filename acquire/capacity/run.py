@@ -41,6 +41,7 @@ if TYPE_CHECKING:
 _PIXEL_FORMAT: dict[str, Literal["Mono8", "Mono12"]] = {"uint8": "Mono8", "uint16": "Mono12"}
 _POLL_S = 0.05
 _GRACE_S = 30.0
+"""Time after its scheduled end in which the load's recording has to end."""
 
 
 @dataclass(frozen=True, slots=True)

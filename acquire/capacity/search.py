@@ -24,7 +24,7 @@ _RING_GOOD = 0.5
 
 
 @dataclass(frozen=True, slots=True)
-class Trial:
+class RateTrial:
     """One run at one rate; ``report`` is None if the capture path failed, and ``trouble`` is the reason."""
 
     line_rate_hz: float
@@ -41,18 +41,18 @@ def search_rate(
     directory: Path,
     first_hz: float,
     seconds: float = RUN_S,
-    progress: Callable[[Trial], object] | None = None,
+    progress: Callable[[RateTrial], object] | None = None,
     most_runs: int = MOST_RUNS,
-) -> list[Trial]:
+) -> list[RateTrial]:
     """Return all runs in order, of which the first is at ``first_hz``; `best` selects the result."""
-    trials: list[Trial] = []
+    trials: list[RateTrial] = []
     good, bad, rate = 0.0, float("inf"), first_hz
     while len(trials) < most_runs and bad > good * NEAR:
         try:
-            trial = Trial(rate, run_load(replace(load, line_rate_hz=rate), directory, seconds))
+            trial = RateTrial(rate, run_load(replace(load, line_rate_hz=rate), directory, seconds))
         # A capture path that fails at this rate is a result of the search, not its end.
         except (DataError, DeviceError) as error:
-            trial = Trial(rate, None, str(error))
+            trial = RateTrial(rate, None, str(error))
         trials.append(trial)
         if progress is not None:
             progress(trial)
@@ -65,6 +65,6 @@ def search_rate(
     return trials
 
 
-def best(trials: list[Trial]) -> Trial | None:
+def best(trials: list[RateTrial]) -> RateTrial | None:
     """Return the fastest run that was sustained; None if none was."""
     return max((trial for trial in trials if trial.held), key=lambda trial: trial.line_rate_hz, default=None)

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
     from acquire.capacity.load import Load
     from acquire.capacity.parts import Parts
-    from acquire.capacity.search import Trial
+    from acquire.capacity.search import RateTrial
 
 
 def register(app: typer.Typer) -> None:
@@ -122,7 +122,7 @@ class _TrialReporter:
         self._advance, self._runs, self._aloud = advance, runs, aloud
         self._done = 0
 
-    def __call__(self, trial: Trial) -> None:
+    def __call__(self, trial: RateTrial) -> None:
         self._done += 1
         self._advance(self._done, self._runs)
         if self._aloud:
@@ -131,7 +131,7 @@ class _TrialReporter:
             say(f"  {quantity(trial.line_rate_hz, 'Hz')}: {result}", err=True)
 
 
-def _row(load: Load, trial: Trial, found: Trial) -> tuple[str, ...]:
+def _row(load: Load, trial: RateTrial, found: RateTrial) -> tuple[str, ...]:
     rate, mb_s = quantity(trial.line_rate_hz, "Hz"), f"{trial.line_rate_hz * load.line_bytes / 1e6:.0f}"
     report = trial.report
     if report is None:
@@ -147,7 +147,7 @@ def _row(load: Load, trial: Trial, found: Trial) -> tuple[str, ...]:
     )
 
 
-def _facts(load: Load, parts: Parts, trials: list[Trial], found: Trial | None) -> dict[str, Any]:
+def _facts(load: Load, parts: Parts, trials: list[RateTrial], found: RateTrial | None) -> dict[str, Any]:
     measured = []
     for trial in trials:
         facts: dict[str, Any] = {"line_rate_hz": trial.line_rate_hz, "held": trial.held}

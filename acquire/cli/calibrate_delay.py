@@ -86,7 +86,7 @@ def _swept(
     """Record the sweep until Ctrl-C; return its exposures, and whether the sweep is complete."""
     from acquire.calibrate import delay_sweep as sweep
     from acquire.cli.interrupts import stop_on_interrupt
-    from acquire.cli.progress import Progress
+    from acquire.cli.progress import ProgressDisplay
     from acquire.daemon.messages import TriggerDelays
 
     note(f"delay: {DELAY.prepare}")
@@ -103,7 +103,7 @@ def _swept(
         about = " and ".join(f"{each:.0f}" for each in late)
         note(f"the light is about {about} ticks late; {len(settings)} recordings of {lines} lines follow")
         exposures = [first]
-        with Progress("sweeping the delays") as progress:
+        with ProgressDisplay("sweeping the delays") as progress:
             for done, each in enumerate(settings):
                 progress.advance(done, len(settings))
                 if stop_requested.is_set():

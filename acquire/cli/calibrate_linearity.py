@@ -92,7 +92,7 @@ def _ramp(out: str, directory: Path, lines: int, socket: Path | None, *, ask: bo
     from acquire.calibrate.checks import offset_of
     from acquire.calibrate.linearity import PARTS, level_ticks, lit_ticks
     from acquire.cli.interrupts import stop_on_interrupt
-    from acquire.cli.progress import Progress
+    from acquire.cli.progress import ProgressDisplay
     from acquire.daemon.messages import TriggerWindow
 
     # Before the recordings, not after: without a dark they could not be evaluated.
@@ -118,7 +118,7 @@ def _ramp(out: str, directory: Path, lines: int, socket: Path | None, *, ask: bo
             f"{len(levels)} more recordings follow, with the light on for up to {brightest} of {ticks} ticks"
         )
         exposures = [whole, dimmest]
-        with Progress("recording the ramp") as progress:
+        with ProgressDisplay("recording the ramp") as progress:
             for done, lit in enumerate(levels):
                 progress.advance(done, len(levels))
                 if stop_requested.is_set():

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from acquire.cli.camera_bench import OPEN_S, Bench
+from acquire.cli.camera_bench import OPEN_S, CameraBench
 from acquire.cli.camera_live import live
 from acquire.cli.completion import rigs
 from acquire.cli.output import JsonFlag, print_facts, print_json, print_table
@@ -51,7 +51,7 @@ def features(serial: SerialArgument, config: ConfigOption = None, json: JsonFlag
     from acquire.camera.look import feature_table
     from acquire.camera.visit import visit
 
-    with Bench(config) as bench:
+    with CameraBench(config) as bench:
         # In a process of its own, which can be ended if the camera's driver hangs.
         rows = visit(bench.opener(serial), feature_table, timeout_s=OPEN_S)
     if json:
@@ -93,7 +93,7 @@ def snapshot(
     is_picture = path.suffix.lower() == ".png"
     if is_picture:
         from PIL import Image  # an extra, which a capture host may not have
-    with Bench(config) as bench:
+    with CameraBench(config) as bench:
         seconds = OPEN_S + lines / bench.line_rate_hz
         # `armed`: the trigger starts only once the camera waits for its pulses.
         pixels, flags = visit(

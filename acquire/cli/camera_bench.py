@@ -18,7 +18,7 @@ OPEN_S = 60.0
 _LISTEN_S = 0.2
 
 
-class Bench:
+class CameraBench:
     """A rig under inspection; without a rig file, any camera that the environment's GenTL producers show."""
 
     def __init__(self, config: str | None, code: LightCode = "rig") -> None:
@@ -74,7 +74,7 @@ class Bench:
             while not self._ending.wait(_LISTEN_S):
                 self._rig.trigger.tags(_LISTEN_S)
 
-    def __enter__(self) -> Bench:
+    def __enter__(self) -> CameraBench:
         if self.config is not None:
             from acquire.rig import Rig
 

@@ -7,8 +7,8 @@ from contextlib import ExitStack
 from typing import TYPE_CHECKING, Protocol
 
 from acquire.camera.gauge import Gauge
-from acquire.camera.live import TURN_S, LiveCamera, View
-from acquire.cli.camera_bench import OPEN_S, Bench
+from acquire.camera.live import TURN_S, ImagePart, LiveCamera
+from acquire.cli.camera_bench import OPEN_S, CameraBench
 from acquire.errors import NoDaemonError, StateError, UsageError
 from acquire.lines import ARMS
 from acquire.stream.peek import Peek
@@ -52,7 +52,7 @@ class LiveSource(Protocol):
 class CameraSource:
     """The cameras themselves, opened while this is entered, with the rig's trigger running."""
 
-    def __init__(self, bench: Bench, serial: str | None) -> None:
+    def __init__(self, bench: CameraBench, serial: str | None) -> None:
         self._bench, self._serial = bench, serial
         self._cameras: list[LiveCamera] = []
         self._end = ExitStack()
@@ -89,17 +89,17 @@ class CameraSource:
     ) -> None:
         self._end.close()
 
-    def _views(self) -> dict[str, dict[str, View]]:
+    def _views(self) -> dict[str, dict[str, ImagePart]]:
         """Map serial numbers to the views of that camera, by arm."""
         config = self._bench.config
         if config is None:
             assert self._serial is not None  # otherwise `open_source` has found a daemon or a rig
-            return {self._serial: {"camera": View()}}
+            return {self._serial: {"camera": ImagePart()}}
         arms = ARMS if self._serial is None else self._bench.arms(self._serial)
-        views: dict[str, dict[str, View]] = {}
+        views: dict[str, dict[str, ImagePart]] = {}
         for arm in arms:
             camera = config.cameras.arm(arm)
-            view = View(config.columns.get(arm), camera.black_level_dn, camera.white_dn)
+            view = ImagePart(config.columns.get(arm), camera.black_level_dn, camera.white_dn)
             # One camera may carry both arms (layout `compact`): it is opened once, and read in two views.
             views.setdefault(camera.serial, {})[arm] = view
         return views
@@ -170,7 +170,7 @@ class RingSource:
 def open_source(config: str | None, serial: str | None, code: LightCode | None, client: Client) -> LiveSource:
     """Return the cameras of a rig file if one is given, else the daemon's, else one of the environment's."""
     if config is not None:
-        return CameraSource(Bench(config, code or "rig"), serial)
+        return CameraSource(CameraBench(config, code or "rig"), serial)
     try:
         client.status()
     except NoDaemonError as error:
@@ -180,7 +180,7 @@ def open_source(config: str | None, serial: str | None, code: LightCode | None, 
             ) from error
         # Without a rig, the cameras are those of the environment's producers, which only a serial number
         # tells apart.
-        return CameraSource(Bench(None), serial)
+        return CameraSource(CameraBench(None), serial)
     if code is not None:
         raise UsageError(
             "--code cannot change the light while the daemon uses the cameras",

@@ -16,7 +16,7 @@ from acquire.errors import AcquireError, DeviceError
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from acquire.daemon.doctor import Finding
+    from acquire.daemon.doctor import CheckResult
 
 # In capitals, since these tables have no colours.
 WORDS = {"good": "good", "warning": "WARNING", "bad": "BAD"}
@@ -70,9 +70,9 @@ def doctor(
         raise typer.Exit(DeviceError.exit_code)
 
 
-def _devices(config: str) -> Iterator[Finding]:
+def _devices(config: str) -> Iterator[CheckResult]:
     from acquire.cli.devices import of_rig
-    from acquire.daemon.doctor import Finding
+    from acquire.daemon.doctor import CheckResult
 
     try:
         for row in of_rig(config):
@@ -80,6 +80,6 @@ def _devices(config: str) -> Iterator[Finding]:
             name = f"{row['model']} {row['serial']} {row['firmware']}".strip()
             text = f"{name or 'it'} is ready" if ready else row["state"]
             todo = "" if ready else "acquire devices lists the devices of this host"
-            yield Finding(row["device"], "good" if ready else "bad", text, todo)
+            yield CheckResult(row["device"], "good" if ready else "bad", text, todo)
     except AcquireError as error:
-        yield Finding("devices", "bad", error.message, error.hint)
+        yield CheckResult("devices", "bad", error.message, error.hint)

@@ -80,11 +80,11 @@ def install_service(
             possible="--config RIG, or --udev for the rule alone",
         )
     from acquire.config import find, load_rig
-    from acquire.daemon.unit import SOCKET, UNIT, Place, unit_text
+    from acquire.daemon.unit import SOCKET, UNIT, UnitPlace, unit_text
     from acquire.place import default_socket
 
     rig = load_rig(config)
-    place = Place.of(user=user)
+    place = UnitPlace.of(user=user)
     where = directory or place.directory
     # By the path of the rig file, also of a built-in one: systemd starts the daemon in another directory.
     files = {where / UNIT: unit_text(rig, find(config, kind="rig"), user=user, account=account)}

@@ -14,21 +14,21 @@ from acquire.cli.progress import stage_progress
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from acquire.evaluate.report import Stage
+    from acquire.evaluate.report import TimedStep
 
 
 @dataclass
-class Journal:
+class StepJournal:
     """The steps of a command that began at ``when``."""
 
-    stages: list[Stage] = field(default_factory=list)
+    stages: list[TimedStep] = field(default_factory=list)
     when: datetime = field(default_factory=lambda: datetime.now(UTC))
 
     @contextmanager
     def stage(self, name: str) -> Iterator[dict[str, str]]:
         """Time a step. The caller may set ``detail`` in the dictionary that it gets."""
         # Only now: it imports NumPy and SciPy, which a run that is refused does without.
-        from acquire.evaluate.report import Stage
+        from acquire.evaluate.report import TimedStep
 
         note: dict[str, str] = {}
         started = time.perf_counter()
@@ -36,6 +36,6 @@ class Journal:
             yield note
         seconds = time.perf_counter() - started
         # A step that fails does not come here: its command ends with an error and without a report.
-        self.stages.append(Stage(name, seconds, note.get("detail", "")))
+        self.stages.append(TimedStep(name, seconds, note.get("detail", "")))
         detail = f"  {note['detail']}" if "detail" in note else ""
         say(f"{name:<34} {seconds:6.1f} s{detail}", err=True)

@@ -25,14 +25,14 @@ KNOWN_S = 4.0
 """Time for which the rate of work is not trusted for that advice, because work starts slowly."""
 
 
-class Progress:
+class ProgressDisplay:
     """Work in progress, from entering the ``with`` block to leaving it.
 
     ``what`` is a participle, such as "verifying run.zarr"; ``advice`` names quicker alternatives. The methods
     are called from one thread; another thread prints.
     """
 
-    _shown: list[Progress] = []  # noqa: RUF012  # one per process, like its stderr; the innermost is last
+    _shown: list[ProgressDisplay] = []  # noqa: RUF012  # one per process, like its stderr; the innermost is last
 
     def __init__(self, what: str, advice: str = "") -> None:
         self._what, self._advice = what, advice
@@ -93,9 +93,9 @@ class Progress:
 
     def __enter__(self) -> Self:
         # Two bars at a time would overwrite each other.
-        if Progress._shown:
-            Progress._shown[-1]._pause()
-        Progress._shown.append(self)
+        if ProgressDisplay._shown:
+            ProgressDisplay._shown[-1]._pause()
+        ProgressDisplay._shown.append(self)
         self._resume()
         return self
 
@@ -103,9 +103,9 @@ class Progress:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self._pause()
-        Progress._shown.remove(self)
-        if Progress._shown:
-            Progress._shown[-1]._resume()
+        ProgressDisplay._shown.remove(self)
+        if ProgressDisplay._shown:
+            ProgressDisplay._shown[-1]._resume()
 
     def _resume(self) -> None:
         from rich.console import Console
@@ -187,7 +187,7 @@ def span(seconds: float) -> str:
 @contextmanager
 def stage_progress(what: str, advice: str = "") -> Iterator[Callable[[float, float], None]]:
     """Show the progress of work that knows its amount: yield a callback that takes (done, total)."""
-    with Progress(what, advice) as progress:
+    with ProgressDisplay(what, advice) as progress:
         yield progress.advance
 
 
@@ -210,5 +210,5 @@ def waiting_printer() -> Callable[[str], None]:
 @contextmanager
 def activity_progress(what: str = "working") -> Iterator[Callable[[str], None]]:
     """Show the progress of work of unknown amount: yield a callback that takes the current activity."""
-    with Progress(what) as progress:
+    with ProgressDisplay(what) as progress:
         yield progress.doing

@@ -366,7 +366,7 @@ def _make(
     began: float,
 ) -> list[Outcome]:
     """Make the videos one after the other, until the first that is interrupted."""
-    from acquire.reconstruct import Watcher, combine, open_pool
+    from acquire.reconstruct import Monitor, combine, open_pool
 
     workers, budget_s = arguments.workers, prepared.options.budget_s
     hurried = budget_s is not None and budget_s < PROCESSES_FROM * _age_s()
@@ -390,10 +390,10 @@ def _make(
             # No advice beside a budget: 20 s were once announced as 25 minutes.
             stage_progress(name, QUICKER if options.budget_s is None else "") as advance,
         ):
-            watcher = Watcher(tasks, advance, stopped.is_set)
-            with open_pool(tasks, workers, arguments.dask, watcher) as pool:
+            monitor = Monitor(tasks, advance, stopped.is_set)
+            with open_pool(tasks, workers, arguments.dask, monitor) as pool:
                 outcome = combine(
-                    recording, request, place, options=options, pool=pool, watcher=watcher, began=began
+                    recording, request, place, options=options, pool=pool, monitor=monitor, began=began
                 )
         outcomes.append(outcome)
         # Ctrl-C is meant for the whole command.

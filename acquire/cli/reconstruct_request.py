@@ -39,12 +39,15 @@ PREVIEW_ITERATIONS = 8
 PREVIEW_BANDWIDTH = 0.5
 """Share of the frames' Nyquist frequency; a search for the best one would take longer than the preview."""
 PREVIEW_MERGE = 4
+"""Sub-steps per frame."""
 PREVIEW_LINES = 320
 """A longer range is previewed in glimpses, spread over the range."""
 PREVIEW_SIDE = 16
 """Voxels along each side of a tile behind a fibre."""
 GLIMPSES = 12
+"""Number of glimpses, those of all tiles together."""
 GLIMPSE_MERGE = 16
+"""Sub-steps per frame of a glimpse."""
 ENDS = {None: None, "trusted": False, "whole": True}
 
 

@@ -58,7 +58,7 @@ def render(
 
     Example: [bold]acquire render fish-1x820.zarr fish-3x4.zarr --out fish.mp4[/]
     """
-    from acquire.evaluate.rendering import Look, Panel, check_suffix
+    from acquire.evaluate.rendering import Appearance, Panel, check_suffix
     from acquire.evaluate.rendering import render as draw
     from acquire.store import open_video
     from acquire.store.delivery import check_new_file, whole_file
@@ -67,7 +67,7 @@ def render(
     sheet = out.suffix.lower() == ".png"
     count = frames if frames is not None else SHEET_FRAMES if sheet else MOVIE_FRAMES
     usual_px = SHEET_HEIGHT if sheet else MOVIE_HEIGHT
-    look = Look(usual_px if height is None else height, peak, fps)
+    look = Appearance(usual_px if height is None else height, peak, fps)
     for name, value, low, high in (
         ("--frames", count, 1, 100_000),
         ("--height", look.panel_px, 16, 4096),

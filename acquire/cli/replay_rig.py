@@ -29,6 +29,7 @@ MEMORY_SHARE = 4
 SHARED_MEMORY = "/dev/shm"  # noqa: S108  # only its free space is read; nothing is written there by name
 MOST_SLOTS = 2**16
 SPARE_SLOTS = 16
+"""Slots in addition to those for the recording, and the fewest if memory is short."""
 PATIENCE_S = 120.0
 """Longest silence of a device: a process may not run for seconds on a busy host, but no device can fail."""
 

@@ -25,7 +25,7 @@ from acquire.errors import EXIT_INTERRUPTED, UsageError
 if TYPE_CHECKING:
     from acquire.evaluate.cases import Case
     from acquire.evaluate.host import HostWatch
-    from acquire.evaluate.tradeoff import Run
+    from acquire.evaluate.tradeoff import TradeoffRun
     from acquire.recon.segments import Voxels
     from acquire.reconstruct.learned import Learned
     from acquire.simulate import Study
@@ -187,57 +187,43 @@ def _measure(
     combinations: list[tuple[str, str, str]],
     longest_s: float,
     host: HostWatch,
-) -> tuple[list[Run], dict[tuple[str, Voxels], Any]]:
+) -> tuple[list[TradeoffRun], dict[tuple[str, Voxels], Any]]:
     """Measure every combination of solver, preset and dtype; return the runs and the true frames to show.
 
     Ctrl-C ends it with the runs made so far, which may have taken hours, if there are any.
     """
-    runs: list[Run] = []
+    from acquire.evaluate.tradeoff import measure
+
+    runs: list[TradeoffRun] = []
     truths: dict[tuple[str, Voxels], Any] = {}
     try:
-        _measure_into(runs, truths, cases, repeats, kinds, combinations, longest_s, host)
+        for case, repeat in itertools.product(cases, range(repeats)):
+            with activity_progress(f"preparing {case.name}"):
+                judge = case.judge(repeat)
+            for voxels, (solver, preset, dtype) in itertools.product(kinds, combinations):
+                # The page says how busy the host was, since that decides the times.
+                host.look()
+                what = f"{case.name}: {solver} {preset} {voxels}, {repeat + 1} of {repeats}"
+                with stage_progress(what) as advance:
+                    run = measure(
+                        judge,
+                        solver,
+                        voxels,
+                        preset=preset,  # type: ignore[arg-type]  # checked in `tradeoff`
+                        longest_s=longest_s,
+                        progress=advance,
+                        dtype=dtype,  # type: ignore[arg-type]  # checked in `tradeoff`
+                    )
+                runs.append(replace(run, case=case.name, repeat=repeat))
+                # The page shows frames of one repeat; a view of them would keep the whole truth in memory.
+                if repeat == 0:
+                    true = judge.truth(voxels)
+                    truths[case.name, voxels] = None if true is None else true[judge.picked(voxels)].copy()
     except KeyboardInterrupt:
         if not runs:
             raise
     host.look()
     return runs, truths
-
-
-def _measure_into(
-    runs: list[Run],
-    truths: dict[tuple[str, Voxels], Any],
-    cases: list[Case],
-    repeats: int,
-    kinds: tuple[Voxels, ...],
-    combinations: list[tuple[str, str, str]],
-    longest_s: float,
-    host: HostWatch,
-) -> None:
-    """Add the runs, and the true frames of the first repeat, as they are made."""
-    from acquire.evaluate.tradeoff import measure
-
-    for case, repeat in itertools.product(cases, range(repeats)):
-        with activity_progress(f"preparing {case.name}"):
-            judge = case.judge(repeat)
-        for voxels, (solver, preset, dtype) in itertools.product(kinds, combinations):
-            # The page says how busy the host was, since that decides the times.
-            host.look()
-            what = f"{case.name}: {solver} {preset} {voxels}, {repeat + 1} of {repeats}"
-            with stage_progress(what) as advance:
-                run = measure(
-                    judge,
-                    solver,
-                    voxels,
-                    preset=preset,  # type: ignore[arg-type]  # checked in `tradeoff`
-                    longest_s=longest_s,
-                    progress=advance,
-                    dtype=dtype,  # type: ignore[arg-type]  # checked in `tradeoff`
-                )
-            runs.append(replace(run, case=case.name, repeat=repeat))
-            # The page shows frames of one repeat; a view of them would keep the whole truth in memory.
-            if repeat == 0:
-                true = judge.truth(voxels)
-                truths[case.name, voxels] = None if true is None else true[judge.picked(voxels)].copy()
 
 
 def _cases(
@@ -301,7 +287,7 @@ def _opened(source: str, out: Path, lines: int) -> tuple[Recording, Study | None
         return open_recording(place), study(bench_of(rig, scene), rig.code.build())
 
 
-def _lessons(runs: list[Run]) -> list[Learned]:
+def _lessons(runs: list[TradeoffRun]) -> list[Learned]:
     """Return the median results of each kind of run. Runs cut by the time limit do not judge their preset."""
     from acquire.evaluate.tradeoff_figures import in_series
     from acquire.reconstruct.learned import Learned
@@ -320,7 +306,7 @@ def _lessons(runs: list[Run]) -> list[Learned]:
     return lessons
 
 
-def _print(runs: list[Run]) -> None:
+def _print(runs: list[TradeoffRun]) -> None:
     """Print where each run ended, and sentences about the accuracy gained over time."""
     from acquire.evaluate.knees import sentences
     from acquire.evaluate.tradeoff_figures import in_series

@@ -12,7 +12,7 @@ import h11
 from pydantic import BaseModel
 
 from acquire.client import core
-from acquire.client.core import Call, EventReader, Target
+from acquire.client.core import ApiCall, EventReader, Target
 from acquire.daemon.facts import Health, News, Reloaded, Rings, Setup, Version
 from acquire.daemon.messages import ArmRequest, CapacityStatus, StartRequest, Status
 from acquire.daemon.options import ArmOptions, StartOptions
@@ -155,7 +155,7 @@ class AsyncClient:
                 core.fact("events", Status).read(status, rest, self._target)
         raise NoDaemonError(f"the daemon on {self._target} has ended", hint=core.IF_ENDED)
 
-    async def call(self, call: Call[T]) -> T:
+    async def call(self, call: ApiCall[T]) -> T:
         """Make a call; a command whose connection breaks is sent once more, with the same id."""
         try:
             return await self._once(call)
@@ -165,7 +165,7 @@ class AsyncClient:
                 raise
         return await self._once(call)
 
-    async def _once(self, call: Call[T]) -> T:
+    async def _once(self, call: ApiCall[T]) -> T:
         limit_s = COMMAND_S if call.method == "POST" else call.timeout_s
         status, content = 0, b""
         path, headers = self._target.path(call.name), call.headers(self._target)

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Self, TypeVar, Unpack
 from pydantic import BaseModel
 
 from acquire.client import core
-from acquire.client.core import Call, EventReader, Target
+from acquire.client.core import ApiCall, EventReader, Target
 from acquire.daemon.facts import Health, News, Reloaded, Rings, Setup, Version
 from acquire.daemon.messages import ArmRequest, CapacityStatus, StartRequest, Status
 from acquire.daemon.options import ArmOptions, StartOptions
@@ -246,7 +246,7 @@ class Client:
 
     # ---- the connection
 
-    def _do(self, call: Call[T]) -> T:
+    def _do(self, call: ApiCall[T]) -> T:
         try:
             return self._once(call)
         except _DisconnectedError:
@@ -256,7 +256,7 @@ class Client:
         # done twice. A third attempt would only delay the error if the daemon is gone.
         return self._once(call)
 
-    def _once(self, call: Call[T]) -> T:
+    def _once(self, call: ApiCall[T]) -> T:
         with self._connection(call.timeout_s) as connection:
             try:
                 path = self._target.path(call.name)

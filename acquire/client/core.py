@@ -2,9 +2,9 @@
 
 ::
 
-    Client (blocking)  ─┐                        ┌─ a Unix socket: the daemon
-                        ├─ Call ▶ bytes ▶ answer ┤
-    AsyncClient        ─┘                        └─ http(s)://host:port, with a token: `acquire web`
+    Client (blocking)  ─┐                           ┌─ a Unix socket: the daemon
+                        ├─ ApiCall ▶ bytes ▶ answer ┤
+    AsyncClient        ─┘                           └─ http(s)://host:port, with a token: `acquire web`
 """
 
 from __future__ import annotations
@@ -121,6 +121,7 @@ class Target:
         return f"{'https' if self.tls else 'http'}://{self.host}:{self.port}"
 
     def path(self, below: str) -> str:
+        """Return the path of a request: the page has the API below a prefix, the daemon's socket has not."""
         return f"/{below}" if self.socket is not None else f"{API}/{below}"
 
     def headers(self) -> dict[str, str]:
@@ -138,7 +139,7 @@ def _no_address(text: str) -> UsageError:
 
 
 @dataclass(frozen=True, slots=True)
-class Call(Generic[T]):
+class ApiCall(Generic[T]):
     """One request, and the model of its answer."""
 
     method: str
@@ -150,6 +151,7 @@ class Call(Generic[T]):
 
     @property
     def content(self) -> bytes | None:
+        """Return the body of the request as JSON; None for a request without one."""
         if self.body is None:
             return None
         # Without what is left at its default: a daemon from before an upgrade need not know options that
@@ -179,14 +181,14 @@ class Call(Generic[T]):
             ) from error
 
 
-def fact(name: str, answer: type[T]) -> Call[T]:
+def fact(name: str, answer: type[T]) -> ApiCall[T]:
     """Return a call for information, which the daemon answers at once."""
-    return Call("GET", name, answer, timeout_s=STATUS_TIMEOUT_S)
+    return ApiCall("GET", name, answer, timeout_s=STATUS_TIMEOUT_S)
 
 
 def command(
     name: str, answer: type[T], body: BaseModel | None = None, request_id: str | None = None
-) -> Call[T]:
+) -> ApiCall[T]:
     """Return a command; it gets a request id unless the caller has one, so that it can be sent again.
 
     Raises UsageError for an id that no header can hold.
@@ -196,7 +198,7 @@ def command(
             f"{name}: request_id = {shown(request_id)} is not a request id",
             possible=f"1 to {LONGEST_ID} printable ASCII characters without spaces",
         )
-    return Call("POST", name, answer, body, request_id=request_id or secrets.token_hex(16))
+    return ApiCall("POST", name, answer, body, request_id=request_id or secrets.token_hex(16))
 
 
 def shows(options: type, model: type[BaseModel]) -> Callable[[Callable[P, Answer]], Callable[P, Answer]]:
@@ -215,18 +217,22 @@ def shows(options: type, model: type[BaseModel]) -> Callable[[Callable[P, Answer
     return decorate
 
 
-def arm(request_id: str | None, **options: Unpack[ArmOptions]) -> Call[Status]:
+def arm(request_id: str | None, **options: Unpack[ArmOptions]) -> ApiCall[Status]:
+    """Return the command. Raises UsageError for options that are not valid."""
     return command("arm", Status, request("arm", ArmRequest, **options), request_id)
 
 
-def start(path: Path | str | None, request_id: str | None, **options: Unpack[StartOptions]) -> Call[Status]:
+def start(
+    path: Path | str | None, request_id: str | None, **options: Unpack[StartOptions]
+) -> ApiCall[Status]:
     """Return the command; a relative ``path`` is relative to the caller's directory."""
     # The daemon has another working directory. Anything else than a path is refused by the model.
     absolute = Path(path).absolute() if isinstance(path, str | os.PathLike) else path
     return command("start", Status, request("start", StartRequest, path=absolute, **options), request_id)
 
 
-def mark(text: str, request_id: str | None) -> Call[Status]:
+def mark(text: str, request_id: str | None) -> ApiCall[Status]:
+    """Return the command. Raises UsageError for a text that is not valid."""
     return command("mark", Status, request("mark", MarkRequest, text=text), request_id)
 
 
@@ -263,6 +269,7 @@ def states_of(states: Collection[State] | State) -> tuple[State, ...]:
 
 
 def events_path(target: Target, *, history: bool, status_s: float | None) -> str:
+    """Return the path of the stream of news, with a status every ``status_s`` unless that is None."""
     query: dict[str, Any] = {"history": "true"} if history else {}
     if status_s is not None:
         query["status_s"] = status_s
@@ -270,6 +277,7 @@ def events_path(target: Target, *, history: bool, status_s: float | None) -> str
 
 
 def events_headers(target: Target, last_id: str | None) -> dict[str, str]:
+    """Return the headers of a request for the stream, continued after the news with the id ``last_id``."""
     headers = {"Accept": "text/event-stream", **target.headers()}
     return headers | ({"Last-Event-ID": last_id} if last_id else {})
 

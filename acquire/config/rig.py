@@ -413,6 +413,7 @@ class RigConfig(FrozenModel):
 
     @property
     def line_period_ticks(self) -> int:
+        """Time from one line to the next, in periods of the trigger's clock."""
         return self.geometry.substeps * self.trigger.substep_ticks
 
     @property

@@ -51,7 +51,9 @@ class WebConfig(FrozenModel):
 
     @property
     def is_loopback(self) -> bool:
+        """Whether only this host can reach the page."""
         return self.host in ("127.0.0.1", "::1", "localhost")
 
     def token_path(self, socket: Path) -> Path:
+        """Return the file of the tokens; by default it is next to the daemon's socket."""
         return self.token_file or socket.with_name(socket.name + ".tokens")

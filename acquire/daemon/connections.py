@@ -54,6 +54,7 @@ LAST_S = 0.7
 """Time for open connections when the server ends: a stream has no end of its own, and half a request may stay
 incomplete. If uvicorn cancelled them after `GRACE_S`, they would be answered with 500."""
 MOST_DESCRIPTORS = 65536
+"""Number of descriptors that is asked for, where the host permits more or sets no limit."""
 
 log = logging.getLogger("acquire.daemon")
 
@@ -133,6 +134,7 @@ class Connection(H11Protocol):
         return cycle is not None and not cycle.more_body and not cycle.response_complete
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
+        """Limit the wait for the first request; if there are too many connections, close an idle one."""
         super().connection_made(transport)
         # From the first moment: a client that connects and sends nothing occupies a descriptor.
         self._wait(REQUEST_S)

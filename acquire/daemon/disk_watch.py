@@ -26,6 +26,7 @@ if TYPE_CHECKING:
 
 LOOK_EVERY_S = 2.0
 WINDOW_S = 60.0
+"""The rate at which the disk fills is the mean over this time."""
 LEAST_S = 5.0
 """Duration of a recording before its measured rate is used."""
 

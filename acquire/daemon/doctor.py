@@ -48,7 +48,7 @@ _STA_UNSYNC = 0x40
 
 
 @dataclass(frozen=True, slots=True)
-class Finding:
+class CheckResult:
     """What was examined, its condition, and what to do if it is not good."""
 
     name: str
@@ -57,29 +57,29 @@ class Finding:
     todo: str = ""
 
 
-def examine(rig: RigConfig | None, running: str | None) -> Iterator[Finding]:
+def examine(rig: RigConfig | None, running: str | None) -> Iterator[CheckResult]:
     """Yield all findings about the host; devices are examined elsewhere.
 
     ``running`` is the version of the daemon that runs here, if any.
     """
     text = f"acquire {__version__} on Python {sys.version.split()[0]}, numpy {np.__version__}"
-    yield Finding("versions", "good", text)
+    yield CheckResult("versions", "good", text)
     yield _foreign_package()
     yield _plugins()
     yield _descriptors()
     cores = usable_cores()
     if cores >= 4:
-        yield Finding("processors", "good", f"{cores} can be used")
+        yield CheckResult("processors", "good", f"{cores} can be used")
     else:
         text, todo = f"{cores} can be used: enough to simulate", "four or more for two cameras"
-        yield Finding("processors", "warning", text, todo)
+        yield CheckResult("processors", "warning", text, todo)
     yield _governor()
     yield _realtime(rig)
     yield _sessions(rig)
     yield _memory(rig)
     yield from _disk(Path() if rig is None else rig.recording.directory)
     if rig is not None and shares_disk(rig.recording.upload_to, rig.recording.directory.absolute()):
-        yield Finding(
+        yield CheckResult(
             "uploads",
             "warning",
             f"{rig.recording.upload_to} is on the disk of the recordings: every line takes its room twice, "
@@ -92,22 +92,22 @@ def examine(rig: RigConfig | None, running: str | None) -> Iterator[Finding]:
     yield from _producers(rig)
     yield from _port(rig)
     if running is None:
-        yield Finding("daemon", "good", "none is running")
+        yield CheckResult("daemon", "good", "none is running")
     elif running != __version__:
         text = f"the one that runs is acquire {running}, and this is {__version__}"
-        yield Finding("daemon", "warning", text, "restart it")
+        yield CheckResult("daemon", "warning", text, "restart it")
     else:
-        yield Finding("daemon", "good", f"acquire {running} is running")
+        yield CheckResult("daemon", "good", f"acquire {running} is running")
 
 
-def _foreign_package() -> Finding:
+def _foreign_package() -> CheckResult:
     """Find other distributions with a package `acquire`, of which PyPI has one: they break each other."""
     owners = set(metadata.packages_distributions().get("acquire", ()))
     # PyPI's acquire-imaging is one.
     others = sorted(owners - {"tdi-acquire"})
     if not others:
-        return Finding("package", "good", "no other distribution installs a package `acquire`")
-    return Finding(
+        return CheckResult("package", "good", "no other distribution installs a package `acquire`")
+    return CheckResult(
         "package",
         "bad",
         f"{', '.join(others)} installs a package `acquire`, too: one hides the other",
@@ -115,23 +115,23 @@ def _foreign_package() -> Finding:
     )
 
 
-def _plugins() -> Finding:
+def _plugins() -> CheckResult:
     """Check the plug-ins of other distributions; those of this one are part of the installation."""
     others = [(group, each) for group in GROUPS for each in group.found() if each.distribution != OURS]
     broken = [f"{group.what} {each.name} of {each.origin}" for group, each in others if group.trouble(each)]
     if broken:
         text = f"cannot be used: {', '.join(broken)}"
-        return Finding("plug-ins", "warning", text, "acquire plugins, which says why")
+        return CheckResult("plug-ins", "warning", text, "acquire plugins, which says why")
     text = f"{len(others)} of other distributions, all work" if others else "no other distribution brings any"
-    return Finding("plug-ins", "good", text)
+    return CheckResult("plug-ins", "good", text)
 
 
-def _descriptors() -> Finding:
+def _descriptors() -> CheckResult:
     # The hard limit, to which the daemon raises its soft one (`connections.raise_descriptor_limit`).
     _, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     if hard == resource.RLIM_INFINITY or hard >= LEAST_DESCRIPTORS:
-        return Finding("descriptors", "good", f"a process may have {'any number' if hard < 0 else hard}")
-    return Finding(
+        return CheckResult("descriptors", "good", f"a process may have {'any number' if hard < 0 else hard}")
+    return CheckResult(
         "descriptors",
         "warning",
         f"a process may have only {hard}",
@@ -139,15 +139,15 @@ def _descriptors() -> Finding:
     )
 
 
-def _governor() -> Finding:
+def _governor() -> CheckResult:
     files = sorted(Path("/sys/devices/system/cpu").glob("cpu[0-9]*/cpufreq/scaling_governor"))
     found = {_read(path) for path in files}
     slow = sorted(found - {"performance", "schedutil", ""})
     if not slow:
-        return Finding(
+        return CheckResult(
             "frequency", "good", f"governor {', '.join(sorted(found)) or 'not reported by this kernel'}"
         )
-    return Finding(
+    return CheckResult(
         "frequency",
         "warning",
         f"governor {', '.join(slow)}: slow to wake",
@@ -155,24 +155,26 @@ def _governor() -> Finding:
     )
 
 
-def _realtime(rig: RigConfig | None) -> Finding:
+def _realtime(rig: RigConfig | None) -> CheckResult:
     soft, _ = resource.getrlimit(resource.RLIMIT_RTPRIO)
     allowed = soft != 0 or os.geteuid() == 0  # root has CAP_SYS_NICE, for which there is no limit
     wanted = rig is not None and rig.stream.realtime
     if allowed:
-        return Finding("real time", "good", "this user may run grabbers in real time")
+        return CheckResult("real time", "good", "this user may run grabbers in real time")
     level: Level = "bad" if wanted else "warning"
     why = ", and stream.realtime asks for it" if wanted else "; without it, others may delay them"
     todo = "LimitRTPRIO=1 in the unit (acquire install-service), or rtprio in /etc/security/limits.d/"
-    return Finding("real time", level, f"this user may not run grabbers in real time{why}", todo)
+    return CheckResult("real time", level, f"this user may not run grabbers in real time{why}", todo)
 
 
-def _sessions(rig: RigConfig | None) -> Finding:
+def _sessions(rig: RigConfig | None) -> CheckResult:
     if not sessions_share():
-        return Finding("sessions", "good", "the kernel shares the processors among processes, by their nice")
+        return CheckResult(
+            "sessions", "good", "the kernel shares the processors among processes, by their nice"
+        )
     if rig is not None and rig.stream.realtime:
-        return Finding("sessions", "good", "grabbers in real time run ahead of all sessions")
-    return Finding(
+        return CheckResult("sessions", "good", "grabbers in real time run ahead of all sessions")
+    return CheckResult(
         "sessions",
         "warning",
         "the kernel shares the processors among sessions: a program in another terminal gets as much as the "
@@ -181,42 +183,42 @@ def _sessions(rig: RigConfig | None) -> Finding:
     )
 
 
-def _memory(rig: RigConfig | None) -> Finding:
+def _memory(rig: RigConfig | None) -> CheckResult:
     there = available_bytes()
     if rig is None:
-        return Finding("memory", "good", f"{there / 1e9:.1f} GB are available")
+        return CheckResult("memory", "good", f"{there / 1e9:.1f} GB are available")
     line_bytes = rig.pixels * np.dtype(rig.cameras.a.dtype).itemsize
     rings = len(ARMS) * rig.ring_slots * rig.stream.block_lines * line_bytes
     text = f"{there / 1e9:.1f} GB are available, and the rings need {rings / 1e9:.2f} GB"
     if there > SPARE_MEMORY * rings:
-        return Finding("memory", "good", text)
-    return Finding("memory", "bad", text, "a smaller stream.ring_seconds, or end other programs")
+        return CheckResult("memory", "good", text)
+    return CheckResult("memory", "bad", text, "a smaller stream.ring_seconds, or end other programs")
 
 
-def _disk(directory: Path) -> Iterator[Finding]:
+def _disk(directory: Path) -> Iterator[CheckResult]:
     path = directory.absolute()
     if not path.is_dir():
         # Where something else is, none can be made.
         make = "" if os.path.lexists(path) else f"mkdir -p {path}, or "
-        yield Finding("disk", "bad", f"{path} is not a directory", f"{make}recording.directory")
+        yield CheckResult("disk", "bad", f"{path} is not a directory", f"{make}recording.directory")
         return
     if os.statvfs(path).f_flag & os.ST_RDONLY:
         text = f"{path} is on a disk that is mounted read-only"
-        yield Finding("disk", "bad", text, "mount it for writing, or recording.directory on another disk")
+        yield CheckResult("disk", "bad", text, "mount it for writing, or recording.directory on another disk")
         return
     if not os.access(path, os.W_OK | os.X_OK):
-        yield Finding("disk", "bad", f"{path} is not writable for this user", f"chown or chmod {path}")
+        yield CheckResult("disk", "bad", f"{path} is not writable for this user", f"chown or chmod {path}")
         return
     free_gb, kind = shutil.disk_usage(path).free / 1e9, _file_system(path)
     text = f"{path}: {free_gb:.0f} GB free on {kind or 'a file system of unknown type'}"
     if kind in NETWORK_DISKS:
-        yield Finding(
+        yield CheckResult(
             "disk", "warning", f"{text}: it waits for a network", "a local disk, and recording.upload_to"
         )
     elif free_gb < DISK_GB:
-        yield Finding("disk", "warning", text, "remove recordings, or set recording.retention")
+        yield CheckResult("disk", "warning", text, "remove recordings, or set recording.retention")
     else:
-        yield Finding("disk", "good", text)
+        yield CheckResult("disk", "good", text)
 
 
 def _file_system(path: Path) -> str:
@@ -247,51 +249,51 @@ class _Timex(ctypes.Structure):
     )
 
 
-def _clock() -> Finding:
+def _clock() -> CheckResult:
     timex = _Timex()
     # With `modes` = 0 the call changes nothing, and needs no rights.
     state = ctypes.CDLL(None).adjtimex(ctypes.byref(timex))
     if state < 0:
-        return Finding("clock", "warning", "the kernel does not report whether the clock is synchronised")
+        return CheckResult("clock", "warning", "the kernel does not report whether the clock is synchronised")
     if state == _TIME_ERROR or timex.status & _STA_UNSYNC:
-        return Finding(
+        return CheckResult(
             "clock",
             "warning",
             "the host's clock is not synchronised: UTC in recordings is as wrong as this clock",
             "chrony or systemd-timesyncd; the lines' own times come from the trigger",
         )
-    return Finding("clock", "good", f"synchronised, within {timex.maxerror / 1000:.1f} ms")
+    return CheckResult("clock", "good", f"synchronised, within {timex.maxerror / 1000:.1f} ms")
 
 
 def _uses(rig: RigConfig | None, *drivers: str) -> bool:
     return rig is not None and any(rig.cameras.arm(arm).driver in drivers for arm in ARMS)
 
 
-def _network(rig: RigConfig | None) -> Iterator[Finding]:
+def _network(rig: RigConfig | None) -> Iterator[CheckResult]:
     """Check the size of a socket's buffer: with a small one, GigE Vision loses packets."""
     if not _uses(rig, "aravis"):
         return
     most = int(_read(Path("/proc/sys/net/core/rmem_max")) or 0)
     text = f"a socket may buffer {most / 2**20:.1f} MiB"
     if most >= RECEIVE_BYTES:
-        yield Finding("network", "good", text)
+        yield CheckResult("network", "good", text)
     else:
-        yield Finding("network", "warning", text, f"sysctl -w net.core.rmem_max={RECEIVE_BYTES}")
+        yield CheckResult("network", "warning", text, f"sysctl -w net.core.rmem_max={RECEIVE_BYTES}")
 
 
-def _usb(rig: RigConfig | None) -> Iterator[Finding]:
+def _usb(rig: RigConfig | None) -> Iterator[CheckResult]:
     path = Path("/sys/module/usbcore/parameters/usbfs_memory_mb")
     if not _uses(rig, "aravis", "harvesters") or not path.exists():
         return
     most = int(_read(path) or 0)
     if most == 0 or most >= USB_BUFFER_MB:  # to the kernel, 0 is no limit
-        yield Finding("usb", "good", f"usbfs may use {'any memory' if most == 0 else f'{most} MB'}")
+        yield CheckResult("usb", "good", f"usbfs may use {'any memory' if most == 0 else f'{most} MB'}")
     else:
         todo = f"echo {USB_BUFFER_MB} > {path}, or usbcore.usbfs_memory_mb={USB_BUFFER_MB} at boot"
-        yield Finding("usb", "warning", f"usbfs may use {most} MB, too little for USB3 cameras", todo)
+        yield CheckResult("usb", "warning", f"usbfs may use {most} MB, too little for USB3 cameras", todo)
 
 
-def _producers(rig: RigConfig | None) -> Iterator[Finding]:
+def _producers(rig: RigConfig | None) -> Iterator[CheckResult]:
     if not _uses(rig, "harvesters"):
         return
     assert rig is not None
@@ -300,13 +302,13 @@ def _producers(rig: RigConfig | None) -> Iterator[Finding]:
     found = [str(path) for place in places if place for path in Path(place).glob("*.cti")]
     missing = [path for path in given if not Path(path).is_file()]
     if missing:
-        yield Finding(
+        yield CheckResult(
             "producer", "bad", f"{', '.join(missing)} is not there", "cameras.a.cti: the maker's GenTL file"
         )
     elif given or found:
-        yield Finding("producer", "good", ", ".join(given or found))
+        yield CheckResult("producer", "good", ", ".join(given or found))
     else:
-        yield Finding(
+        yield CheckResult(
             "producer",
             "bad",
             "no GenTL producer: GENICAM_GENTL64_PATH names no directory with one",
@@ -314,7 +316,7 @@ def _producers(rig: RigConfig | None) -> Iterator[Finding]:
         )
 
 
-def _port(rig: RigConfig | None) -> Iterator[Finding]:
+def _port(rig: RigConfig | None) -> Iterator[CheckResult]:
     if rig is None or rig.web is None or rig.web.port == 0:
         return
     family = socket.AF_INET6 if ":" in rig.web.host else socket.AF_INET
@@ -325,9 +327,9 @@ def _port(rig: RigConfig | None) -> Iterator[Finding]:
             probe.bind((rig.web.host, rig.web.port))
     except OSError as error:
         text = f"{rig.web.host}:{rig.web.port}: {error.strerror}"
-        yield Finding("page", "warning", text, "another web.port, unless it is the page that is running")
+        yield CheckResult("page", "warning", text, "another web.port, unless it is the page that is running")
         return
-    yield Finding("page", "good", f"{rig.web.host}:{rig.web.port} is free")
+    yield CheckResult("page", "good", f"{rig.web.host}:{rig.web.port} is free")
 
 
 def _read(path: Path) -> str:

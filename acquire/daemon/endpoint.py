@@ -100,6 +100,7 @@ def check_path(path: Path) -> None:
 
 
 def lock_path(path: Path) -> Path:
+    """Return the file whose lock makes a daemon the only one on this socket."""
     return path.with_name(path.name + ".lock")
 
 

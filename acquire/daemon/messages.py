@@ -408,6 +408,7 @@ RETRY = {"Retry-After": "1"}
 
 
 def http_status(error: AcquireError) -> int:
+    """Return the status code of an answer that reports this error."""
     return next(status for kind, status in HTTP_STATUS if isinstance(error, kind))
 
 
@@ -417,6 +418,7 @@ def fault_error(fault: str | None) -> DeviceError:
 
 
 def error_body(error: AcquireError) -> dict[str, Any]:
+    """Return the JSON body of an answer that reports this error."""
     return ErrorMessage.of(error).model_dump(mode="json")
 
 

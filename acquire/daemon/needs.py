@@ -27,7 +27,7 @@ class CapturePath(Protocol):
     def close(self) -> None: ...
 
 
-class Run(Protocol):
+class ServiceRun(Protocol):
     """The part of `acquire.daemon.plan.Run` that the service needs."""
 
     run_id: str
@@ -44,7 +44,7 @@ class Run(Protocol):
 class OpenRun(Protocol):
     """Creates the next run for a request to arm."""
 
-    def __call__(self, request: ArmRequest) -> Run: ...
+    def __call__(self, request: ArmRequest) -> ServiceRun: ...
 
 
 class Prove(Protocol):

@@ -30,6 +30,7 @@ if TYPE_CHECKING:
 log = logging.getLogger("acquire.daemon")
 
 MOST_KEPT = 2000
+"""Number of latest news kept for clients that connect, or connect again."""
 LOSSES_EVERY_S = 1.0
 """Time between two news of lines lost for one cause: the first is reported at once, later ones are summed."""
 DISK_EVERY_S = 10.0

@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from acquire.store import CodecChoice
 
 VALID_S = 600.0
+"""How long a measurement of this host is used: other programs come and go."""
 TRIES = 3
 """Number of measurements before a rig is refused: a disturbed one gives too little."""
 TIGHT = 0.7

@@ -36,7 +36,7 @@ _ELSEWHERE = "it is open, and was not written on this machine: it may still be g
 
 
 @dataclass(frozen=True, slots=True)
-class Task:
+class RecoveryTask:
     """One recording to be recovered.
 
     ``ours``: left by a run of this daemon, for the reason ``why``. Its recorder had acknowledged
@@ -96,13 +96,13 @@ def _look_at(path: Path, found: Found, *, noted: bool) -> None:
         found.open.append(path)
 
 
-def salvage(mailbox: Mailbox, task: Task) -> None:
+def salvage(mailbox: Mailbox, task: RecoveryTask) -> None:
     """Main function of the process: one recovery, at low priority."""
     stand_back(_NICE, EARLY)
     mailbox.post(_salvage(mailbox, task))
 
 
-def _salvage(mailbox: Mailbox, task: Task) -> RecoveryStatus:
+def _salvage(mailbox: Mailbox, task: RecoveryTask) -> RecoveryStatus:
     path = task.path
     try:
         refuse_links(path)
@@ -140,7 +140,7 @@ def _salvage(mailbox: Mailbox, task: Task) -> RecoveryStatus:
     )
 
 
-def _gone(task: Task) -> str:
+def _gone(task: RecoveryTask) -> str:
     if not task.committed_lines:
         return "it is not there; no line of it was committed"
     return (
@@ -149,7 +149,7 @@ def _gone(task: Task) -> str:
     )
 
 
-def _remove_unborn(task: Task) -> RecoveryStatus:
+def _remove_unborn(task: RecoveryTask) -> RecoveryStatus:
     """Remove a recording whose recorder was killed while preparing it: it has no line and no root."""
     if not task.path.is_dir():
         return RecoveryStatus(path=task.path, state="gone", text=_gone(task))
@@ -161,7 +161,7 @@ def _remove_unborn(task: Task) -> RecoveryStatus:
     return RecoveryStatus(path=task.path, state="gone", lines=0, text=text)
 
 
-def hindrance(task: Task) -> RecoveryStatus | None:
+def hindrance(task: RecoveryTask) -> RecoveryStatus | None:
     """Return the status of a recording that cannot be recovered now, or None."""
     path = task.path
     try:

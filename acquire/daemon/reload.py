@@ -111,10 +111,12 @@ def _differences(key: str, old: Any, new: Any) -> Iterator[ChangedKey]:
 
 
 def words(one: ChangedKey) -> str:
+    """Return the change of a key as text, new value first."""
     return f"{one.key} = {shown(one.new)}, it was {shown(one.old)}"
 
 
 def refusal(fixed: list[ChangedKey]) -> UsageError:
+    """Return the error for keys that only a restart can change; it lists at most `MOST_LISTED` of them."""
     listed = "; ".join(words(one) for one in fixed[:MOST_LISTED])
     more = f"; and {len(fixed) - MOST_LISTED} more" if len(fixed) > MOST_LISTED else ""
     return UsageError(

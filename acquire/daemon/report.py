@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from acquire.stream import CaptureStatus
 
 RATE_WINDOW_S = 5.0
+"""Line rates are means over this time."""
 LOOK_EVERY_S = 0.1
 ANSWER_S = 5.0
 """A trigger that is silent for longer does not answer: it is queried every second."""
@@ -68,6 +69,7 @@ class Rates:
 
 
 def seconds_since(monotonic_s: float) -> float:
+    """Return the time since a `time.monotonic`, rounded to milliseconds."""
     return round(time.monotonic() - monotonic_s, 3)
 
 

@@ -23,7 +23,7 @@ from typing import TYPE_CHECKING
 
 from acquire.daemon.journal import Journal
 from acquire.daemon.messages import RecoveryStatus
-from acquire.daemon.recoverer import RECOVERED, Found, Task, hindrance, salvage, search
+from acquire.daemon.recoverer import RECOVERED, Found, RecoveryTask, hindrance, salvage, search
 from acquire.errors import DeviceError
 from acquire.logs import EACH
 from acquire.processes.messages import Failed
@@ -38,6 +38,7 @@ if TYPE_CHECKING:
 AGAIN_S = 5.0
 """Time between two attempts at a recording that another process holds."""
 MOST_TRIES = 6
+"""Number of attempts at a recording that another process holds."""
 MOST_LISTED = 32
 """Number of latest recordings in the status: more than one run can leave."""
 MOST_ODD = 8
@@ -63,10 +64,10 @@ class Salvage:
         self._not_sealed: dict[Path, None] = {}
         self._begun: set[Path] = set()
         """Recordings of this daemon's runs that began during the search; their ends are reported."""
-        self._tasks: dict[Path, Task] = {}
+        self._tasks: dict[Path, RecoveryTask] = {}
         self._found: dict[Path, RecoveryStatus] = {}
         self._worker: Worker | None = None
-        self._under_way: Task | None = None
+        self._under_way: RecoveryTask | None = None
         self._searching: Future[Found] | None = None
 
     @property
@@ -103,7 +104,7 @@ class Salvage:
             if orphan.path not in self._found or (found is not None and not found.ours):
                 log.warning("%s was not sealed: %s", orphan.path, orphan.why)
                 notes = tuple((note.line, note.kind, note.text) for note in orphan.notes)
-                self._queue(Task(orphan.path, orphan.why, True, orphan.committed_lines, notes=notes))
+                self._queue(RecoveryTask(orphan.path, orphan.why, True, orphan.committed_lines, notes=notes))
 
     def poll(self, *, capturing: bool = False) -> list[RecoveryStatus]:
         """Take results, begin the next recovery, and return those that ended since the last call.
@@ -139,7 +140,7 @@ class Salvage:
         self._cut_off()
         self._tasks.clear()
 
-    def _queue(self, task: Task) -> None:
+    def _queue(self, task: RecoveryTask) -> None:
         self._tasks[task.path] = task
         self._list(RecoveryStatus(path=task.path, state="waiting", text=task.why))
 
@@ -165,7 +166,7 @@ class Salvage:
         for path in found.open:
             # A search on a slow disk may meet what a run has begun since: that is not left by anybody.
             if path not in self._found and path not in self._begun:
-                self._queue(Task(path))
+                self._queue(RecoveryTask(path))
         # What the journal names and the search met neither open nor odd is sealed by now.
         met = {*found.open, *(one.path for one in found.odd)}
         for path in [path for path in self._not_sealed if path not in met and path not in self._begun]:
@@ -209,7 +210,7 @@ class Salvage:
         text = f"the recovering process: {why}"
         return self._settle(task, RecoveryStatus(path=task.path, state="failed", text=text))
 
-    def _settle(self, task: Task, status: RecoveryStatus) -> list[RecoveryStatus]:
+    def _settle(self, task: RecoveryTask, status: RecoveryStatus) -> list[RecoveryStatus]:
         """Put a waiting recording off, or return its final status."""
         del self._tasks[task.path]
         self._list(status)

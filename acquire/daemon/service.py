@@ -11,7 +11,6 @@ import logging
 import os
 import threading
 import time
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -23,7 +22,7 @@ from acquire.daemon.news import NewsLog
 from acquire.daemon.plan import default_path, recording_of
 from acquire.daemon.report import Rates, arm_statuses, seconds_since, trigger_status
 from acquire.daemon.salvage import Salvage
-from acquire.daemon.states import Event, State, after, commands, possible
+from acquire.daemon.states import Event, Situation, State, after, commands, possible
 from acquire.daemon.take import Take, log_event
 from acquire.daemon.troubles import Troubles
 from acquire.daemon.uploads import Uploads
@@ -37,7 +36,7 @@ if TYPE_CHECKING:
 
     from acquire.config import RigConfig
     from acquire.daemon.messages import CapacityStatus, RecoveryStatus, StartRequest
-    from acquire.daemon.needs import OpenRun, Prove, Run
+    from acquire.daemon.needs import OpenRun, Prove, ServiceRun
     from acquire.stream.ring import RingShape
 
 RECOVERY_S = 20.0
@@ -75,18 +74,15 @@ class Service:
         self._capacity: CapacityStatus | None = None
         self._hurried = threading.Event()
         self._born = time.monotonic()
-        self._state = State.IDLE
-        self._since, self._since_s = datetime.now(UTC), time.monotonic()
-        self._busy: str | None = None
-        self._run: Run | None = None
+        self._now = Situation()
+        self._run: ServiceRun | None = None
         self._seen = CaptureStatus()
         self._rates = Rates()
         self._disk = disk_watch(config)
         self._order = StandingOrder(config)
         self._take: Take | None = None
         self._last: LastRecording | None = None
-        self._fault: str | None = None
-        self._published: tuple[State, str | None] = self._state, None
+        self._published: tuple[State, str | None] = self._now.state, self._now.busy
         self._publish()
 
     # ---- any thread
@@ -94,7 +90,7 @@ class Service:
     def status(self) -> Status:
         """Return the latest published status; never waits."""
         # These change even while the devices' thread waits for a device and publishes nothing.
-        ages = {"uptime_s": seconds_since(self._born), "state_s": seconds_since(self._since_s)}
+        ages = {"uptime_s": seconds_since(self._born), "state_s": seconds_since(self._now.since_s)}
         others = {"troubles": self.troubles.statuses, "disk": self._disk.status}
         return self._status.model_copy(update=ages | others)
 
@@ -111,6 +107,7 @@ class Service:
 
     @property
     def hurried(self) -> bool:
+        """Whether `hurry` was called."""
         return self._hurried.is_set()
 
     def hurry(self) -> None:
@@ -168,7 +165,7 @@ class Service:
     def disarm(self) -> None:
         """armed → idle; or clears a fault."""
         with self._doing(Event.DISARM):
-            self._fault = None
+            self._now.fault = None
             try:
                 self._release()
             finally:
@@ -178,22 +175,24 @@ class Service:
     def sign(self, command: str, who: str) -> None:
         """Record who gave a command, in the log and among the events of the current recording."""
         log.info("%s by %s", command, who, extra=EACH)
-        if self._run is not None and self._state in (State.RECORDING, State.DRAINING):
+        if self._run is not None and self._now.state in (State.RECORDING, State.DRAINING):
             self._run.capture.note("operator", f"{command} by {who}")
 
     def measure(self) -> None:
         """Measure again what the host sustains; only while idle, since a run would disturb it."""
-        if self._state is not State.IDLE:
-            raise StateError(f"measuring is impossible while {self._state}", possible=possible(self._state))
+        if self._now.state is not State.IDLE:
+            raise StateError(
+                f"measuring is impossible while {self._now.state}", possible=possible(self._now.state)
+            )
         if self._prove is None:
             raise UsageError("this rig's capacity cannot be measured", hint="acquire bench --config RIG")
-        self._busy = "capacity"
+        self._now.busy = "capacity"
         self._publish()
         try:
             # Forced: here an insufficient rate is the answer, and not a refusal.
             self._capacity = self._prove(force=True, fresh=True, progress=self._show)
         finally:
-            self._busy = None
+            self._now.busy = None
             self._publish()
 
     def reconfigure(self, config: RigConfig, text: str) -> None:
@@ -203,7 +202,7 @@ class Service:
         self._uploads.keep(config.recording.reserve_bytes)
         if self._run is not None:
             self._run.adopt(config.recording)
-            if self._state in (State.RECORDING, State.DRAINING):
+            if self._now.state in (State.RECORDING, State.DRAINING):
                 self._run.capture.note("operator", text)
         self._publish()
 
@@ -217,7 +216,7 @@ class Service:
         beside: tuple[tuple[str, Callable[[], object]], ...] = (
             ("recoveries", lambda: self._recovered(self._salvage.poll(capturing=self._run is not None))),
             ("uploads", self._uploads.poll),
-            ("disk", lambda: self._disk.check(recording=self._state is State.RECORDING)),
+            ("disk", lambda: self._disk.check(recording=self._now.state is State.RECORDING)),
         )
         for what, work in beside:
             try:
@@ -243,17 +242,17 @@ class Service:
     def shutdown(self) -> None:
         """Seal and release, whatever the state. Bounded in time; raises only errors of closing a run."""
         try:
-            if self._state is State.RECORDING:
+            if self._now.state is State.RECORDING:
                 self._stop("signal")
-            while self._state is State.DRAINING:
+            while self._now.state is State.DRAINING:
                 # A disk that makes no progress must not keep the daemon from ending: the next daemon recovers
                 # the recording.
                 if self._take is not None and self._seen.waiting and self._idles(self._take):
                     break
                 self.supervise()
-                if self._state is State.DRAINING:
+                if self._now.state is State.DRAINING:
                     self._hurried.wait(POLL_S)
-            if self._state is State.ARMED:
+            if self._now.state is State.ARMED:
                 self.disarm()
         except (AcquireError, OSError) as error:
             log.error("while ending: %s", error)  # noqa: TRY400 - no traceback for users
@@ -284,9 +283,9 @@ class Service:
         assert self._run is not None
         for note in self._run.capture.take_events():
             self._try_event(note)
-        if self._state is State.RECORDING and (seen.draining or seen.done):
+        if self._now.state is State.RECORDING and (seen.draining or seen.done):
             self._go(Event.FULL)
-        if self._state is not State.DRAINING:
+        if self._now.state is not State.DRAINING:
             return
         assert self._take is not None
         if seen.done or self.hurried:
@@ -347,7 +346,7 @@ class Service:
             self._order.used = True
         elif take is None:
             log.info("the event starts no recording: another did since the instrument was armed")
-        elif take.by_event and self._state is State.RECORDING:
+        elif take.by_event and self._now.state is State.RECORDING:
             self._run.capture.extend(self._order.end_line(note))
         elif take.by_event and take.late is None:
             take.late = note
@@ -376,20 +375,20 @@ class Service:
     def _with_cause(self, trouble: str) -> str:
         """Return the text of a failure, after its probable cause: the reason why the recording ended."""
         seen, cause = self._seen, self._seen.fault
-        ending = self._state in (State.RECORDING, State.DRAINING)
+        ending = self._now.state in (State.RECORDING, State.DRAINING)
         if cause is None and ending and seen.condition is not RunCondition.GOOD:
             cause = seen.end_reason
         return f"{cause}; then, while ending: {trouble}" if cause else trouble
 
     def _fail(self, text: str) -> None:
         """Publish the fault at once, release the devices, and wait until it is read."""
-        self._fault = text
+        self._now.fault = text
         self._publish()
         try:
             self._release()
         except AcquireError as error:
-            self._fault = f"{text}; then, while ending: {error}"
-        self._go(Event.FAULT, self._fault)
+            self._now.fault = f"{text}; then, while ending: {error}"
+        self._go(Event.FAULT, self._now.fault)
 
     def _release(self) -> None:
         """Close the run and remember its recording. Raises errors of closing it, OSError as DeviceError."""
@@ -434,44 +433,46 @@ class Service:
     @contextlib.contextmanager
     def _doing(self, command: Event) -> Iterator[None]:
         """Refuse a command that the state does not allow, or mark it busy. Raises a fault that it ends in."""
-        after(self._state, command)
-        self._busy = command
+        after(self._now.state, command)
+        self._now.busy = command
         self._publish()
         try:
             yield
-            if self._state is State.FAULTED:
-                raise fault_error(self._fault)
+            if self._now.state is State.FAULTED:
+                raise fault_error(self._now.fault)
         except AcquireError as error:
             log.error("%s: %s", command, error)  # noqa: TRY400 - no traceback for users
             raise
         finally:
-            self._busy = None
+            self._now.busy = None
             self._publish()
 
     def _show(self, what: str) -> None:
         """Show in the status what the current command is waiting for."""
-        self._busy = f"{(self._busy or '').split(':')[0]}: {what}"
+        self._now.busy = f"{(self._now.busy or '').split(':')[0]}: {what}"
         self._publish()
 
     def _go(self, event: Event, why: str = "") -> None:
-        before, self._state = self._state, after(self._state, event)
-        self._since, self._since_s = datetime.now(UTC), time.monotonic()
+        before = self._now.state
+        self._now.go(event)
         level = logging.ERROR if event is Event.FAULT else logging.INFO
-        log.log(level, "%s → %s (%s%s)", before, self._state, event, f": {why}" if why else "", extra=EACH)
+        log.log(
+            level, "%s → %s (%s%s)", before, self._now.state, event, f": {why}" if why else "", extra=EACH
+        )
         path = self._take.path if self._take else self._last.path if self._last else None
         news = f"{event}: {why}" if why else str(event)
         importance = "error" if event is Event.FAULT else "info"
-        self.news.add("state", news, self._state, level=importance, path=path)
+        self.news.add("state", news, self._now.state, level=importance, path=path)
         self._publish()
 
     def _publish(self) -> None:
         # Progress, by which the watchdog tells a slow command from one that hangs.
         self.moved_s = time.monotonic()
         self._status = Status(
-            state=self._state,
-            since=self._since,
-            possible=[str(command) for command in commands(self._state)],
-            busy=self._busy,
+            state=self._now.state,
+            since=self._now.since,
+            possible=[str(command) for command in commands(self._now.state)],
+            busy=self._now.busy,
             name=self.config.name,
             version=__version__,
             pid=os.getpid(),
@@ -482,7 +483,7 @@ class Service:
             trigger=None if self._run is None else trigger_status(self._seen),
             last=self._last,
             waiting=self._seen.waiting or None,
-            fault=self._fault,
+            fault=self._now.fault,
             capacity=self._capacity,
             calibration=None if self._run is None else self._run.calibration,
             processes={} if self._run is None else self._seen.pids,
@@ -493,6 +494,6 @@ class Service:
         )
         self.news.update(self.status())
         # Streams send a status whenever they are woken: clients see a new state or step at once.
-        before, self._published = self._published, (self._state, self._busy)
+        before, self._published = self._published, (self._now.state, self._now.busy)
         if before != self._published:
             self.news.wake()

@@ -20,6 +20,9 @@ configuration or a signal) and FAULT. Transitions that are not drawn are refused
 
 from __future__ import annotations
 
+import time
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
 from enum import StrEnum
 
 from acquire.errors import StateError
@@ -95,3 +98,19 @@ def commands(state: State) -> tuple[Event, ...]:
 def possible(state: State) -> str:
     """Return the commands that ``state`` allows, as text."""
     return ", ".join(commands(state))
+
+
+@dataclass(slots=True)
+class Situation:
+    """The state, since when (UTC, and monotonic), the command in progress, and the fault to be read."""
+
+    state: State = State.IDLE
+    since: datetime = field(default_factory=lambda: datetime.now(UTC))
+    since_s: float = field(default_factory=time.monotonic)
+    busy: str | None = None
+    fault: str | None = None
+
+    def go(self, event: Event) -> None:
+        """Change to the state that ``event`` leads to. Raises StateError if the table has no row for it."""
+        self.state = after(self.state, event)
+        self.since, self.since_s = datetime.now(UTC), time.monotonic()

@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from acquire.daemon.news import NewsLog
 
 ALIVE_S = 1.0
+"""Longest silence of a stream: clients take a longer one for the daemon's death."""
 ALIVE = ": alive\n\n"
 """Also sent after the news with which a stream begins: the client then knows that these were all."""
 MOST_STREAMS = 16
@@ -44,11 +45,11 @@ class Places:
     def __len__(self) -> int:
         return len(self._taken)
 
-    def take(self) -> Place:
-        return Place(self._taken)
+    def take(self) -> StreamPlace:
+        return StreamPlace(self._taken)
 
 
-class Place:
+class StreamPlace:
     """A place, also given back when its stream is dropped before its first step."""
 
     def __init__(self, taken: set[int]) -> None:
@@ -86,7 +87,9 @@ class Streams:
             last_id = self._log.last_id
         return self._stream(self._places.take(), last_id, status_s)
 
-    async def _stream(self, place: Place, last_id: str | None, status_s: float | None) -> AsyncIterator[str]:
+    async def _stream(
+        self, place: StreamPlace, last_id: str | None, status_s: float | None
+    ) -> AsyncIterator[str]:
         loop, woken = asyncio.get_running_loop(), asyncio.Event()
 
         def wake() -> None:
@@ -128,8 +131,10 @@ async def wait(woken: asyncio.Event, seconds: float) -> None:
 
 
 def news_text(news: News) -> str:
+    """Return news as an event of the stream, with the id from which a client can continue."""
     return f"id: {news.id}\nevent: news\ndata: {news.model_dump_json()}\n\n"
 
 
 def status_text(status: Status) -> str:
+    """Return a status as an event of the stream. It has no id: it is never sent again."""
     return f"event: status\ndata: {status.model_dump_json()}\n\n"

@@ -39,14 +39,14 @@ SUBSYSTEM=="tty", ATTRS{idVendor}=="0403", MODE="0660", GROUP="plugdev", TAG+="u
 
 
 @dataclass(frozen=True, slots=True)
-class Place:
+class UnitPlace:
     """Directory of the unit, and whether it is for one user or the host."""
 
     user: bool
     directory: Path
 
     @classmethod
-    def of(cls, *, user: bool) -> Place:
+    def of(cls, *, user: bool) -> UnitPlace:
         if user:
             configuration = os.environ.get("XDG_CONFIG_HOME") or home() / ".config"
             return cls(True, Path(configuration) / "systemd/user")

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from acquire.errors import UsageError
-from acquire.evaluate.tradeoff import Judge
+from acquire.evaluate.tradeoff import TruthJudge
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -27,7 +27,7 @@ class Case:
     """
 
     name: str
-    judge: Callable[[int], Judge]
+    judge: Callable[[int], TruthJudge]
     repeats: str
 
 
@@ -46,10 +46,10 @@ def recording_case(
     """
     last = recording.first_line + recording.lines - lines
 
-    def judge(repeat: int) -> Judge:
+    def judge(repeat: int) -> TruthJudge:
         # where the recording ends, the last lines once more
         first = max(recording.first_line, min(first_line + apart * repeat, last))
-        return Judge.of(recording, recording.cut(first, lines, tile), tile)
+        return TruthJudge.of(recording, recording.cut(first, lines, tile), tile)
 
     differences = "other lines if there are any, with other code bits and other noise"
     return Case(name if tile is None else f"{name}, tile {tile}", judge, differences)
@@ -57,15 +57,15 @@ def recording_case(
 
 def procedural(name: str, full_well_e: float, lines: int) -> Case:
     """Return a case of a procedural scene, 192 × 192 fine pixels; each repeat draws scene, code and noise."""
-    from acquire.sim.procedural import Camera, record
+    from acquire.sim.procedural import CameraNoise, record
 
     noisy = math.isfinite(full_well_e)
-    camera = Camera(full_well_e, READ_NOISE_E if noisy else 0.0)
+    camera = CameraNoise(full_well_e, READ_NOISE_E if noisy else 0.0)
 
-    def judge(repeat: int) -> Judge:
+    def judge(repeat: int) -> TruthJudge:
         # a seed determines scene, code and noise
         recorded = record(name, repeat + 1, lines=lines, camera=camera)
-        return Judge(recorded.segment, None, recorded.light)
+        return TruthJudge(recorded.segment, None, recorded.light)
 
     noise = f"{full_well_e:.0f} electrons at the brightest" if noisy else "clean"
     return Case(f"{name}, {noise}", judge, "another draw of scene, code and noise")

@@ -93,6 +93,7 @@ class CurveComparison:
 
     @property
     def frequency_error_hz(self) -> float | None:
+        """Measured minus theoretical frequency; None for a region that is constant in theory."""
         return None if self.constant else self.measured.frequency_hz - self.theory.frequency_hz
 
 

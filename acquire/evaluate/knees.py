@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from acquire.evaluate.tradeoff import Run
+    from acquire.evaluate.tradeoff import TradeoffRun
 
 Clock = Literal["seconds", "processor_s"]
 
@@ -54,7 +54,7 @@ class Knee:
     """The run ended normally before twice this time."""
 
 
-def band(runs: Sequence[Run], name: str, clock: Clock = "seconds") -> Band | None:
+def band(runs: Sequence[TradeoffRun], name: str, clock: Clock = "seconds") -> Band | None:
     """Return a quantity of all repeats over the wall or processor time; None if it is not known."""
     stairs = []
     for run in runs:
@@ -97,7 +97,7 @@ def knees(curve: Band, *, ended: bool) -> list[Knee]:
     return [each for each in found if each.value >= first + STEEP_DB] or found[-1:]
 
 
-def sentences(runs: Sequence[Run]) -> list[str]:
+def sentences(runs: Sequence[TradeoffRun]) -> list[str]:
     """Describe what the time gains for one solver, preset and dtype; empty if the truth is not known."""
     curve = band(runs, "psnr_db")
     if curve is None:

@@ -41,6 +41,7 @@ def svg_uri(svg: str) -> str:
 
 
 def webp_uri(webp: bytes) -> str:
+    """Return an animation as a data URI."""
     return _data_uri("image/webp", webp)
 
 

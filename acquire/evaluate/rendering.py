@@ -32,7 +32,7 @@ SUFFIXES = (".mp4", ".gif", ".webp", ".png", ".html")
 
 
 @dataclass(frozen=True, slots=True)
-class Look:
+class Appearance:
     """Appearance of a rendering: panel height, value of white (None: from the video), frame rate, labels."""
 
     panel_px: int = 384
@@ -98,7 +98,7 @@ def common_times(panels: Sequence[Panel], count: int) -> NDArray[np.int64]:
 def render(
     panels: Sequence[Panel],
     path: Path,
-    look: Look,
+    look: Appearance,
     count: int,
     progress: Callable[[int, int], object] | None = None,
 ) -> int:
@@ -137,7 +137,11 @@ def render(
 
 
 def _picture(
-    panels: Sequence[Panel], frames: Sequence[NDArray[Any]], peaks: Sequence[float], look: Look, stamp: str
+    panels: Sequence[Panel],
+    frames: Sequence[NDArray[Any]],
+    peaks: Sequence[float],
+    look: Appearance,
+    stamp: str,
 ) -> Image.Image:
     greys = [grey(frame, peak, look.panel_px) for frame, peak in zip(frames, peaks, strict=True)]
     bar = BAR_PX if look.label else 0

@@ -20,7 +20,7 @@ from acquire.evaluate.result import (
     Region,
     RigFacts,
     SolverResult,
-    Stage,
+    TimedStep,
     evaluate_solver,
 )
 from acquire.evaluate.summary import summarise
@@ -37,7 +37,7 @@ __all__ = [
     "Region",
     "RigFacts",
     "SolverResult",
-    "Stage",
+    "TimedStep",
     "evaluate_solver",
     "render_page",
     "write_report",

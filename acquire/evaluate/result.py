@@ -58,6 +58,7 @@ class ArmAccount:
 
     @property
     def lost_lines(self) -> int:
+        """Lines lost for any cause."""
         return sum(self.lost.values())
 
 
@@ -89,7 +90,7 @@ class Region:
 
 
 @dataclass(frozen=True, slots=True)
-class Stage:
+class TimedStep:
     """One step of the run and its duration."""
 
     name: str
@@ -170,7 +171,7 @@ class DemoResult:
     truth: NDArray[Any]
     solvers: tuple[SolverResult, ...]
     regions: tuple[Region, ...]
-    stages: tuple[Stage, ...]
+    stages: tuple[TimedStep, ...]
     host: Busyness
 
     def __post_init__(self) -> None:
@@ -214,6 +215,7 @@ class DemoResult:
 
     @property
     def frame_interval_us(self) -> float:
+        """Mean time from one frame to the next."""
         return float(np.diff(self.frame_ms).mean()) * 1e3
 
     @property

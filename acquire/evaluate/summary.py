@@ -69,6 +69,7 @@ def capture_summary(capture: CaptureFacts) -> dict[str, Any]:
 
 
 def ledger_summary(ledger: ArmAccount) -> dict[str, Any]:
+    """Summarise one arm's account of its lines since arming."""
     return {
         "delivered": ledger.delivered,
         "preroll": ledger.preroll,
@@ -105,6 +106,7 @@ def span_voxels(result: DemoResult) -> float:
 
 
 def solver_summary(solver: SolverResult, set_hz: list[float | None]) -> dict[str, Any]:
+    """Summarise a solver's result; ``set_hz`` are the frequencies that its curves' regions were driven at."""
     return {
         "label": solver.label,
         "seconds": rounded(solver.seconds, 2),

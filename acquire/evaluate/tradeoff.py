@@ -71,7 +71,7 @@ class Point:
 
 
 @dataclass(frozen=True, slots=True)
-class Run:
+class TradeoffRun:
     """One reconstruction, from its first result to its last; ``ended`` is the reason for its end.
 
     ``case`` names the scene and its noise; ``repeat`` counts runs with the same settings. ``mean_db`` is the
@@ -100,7 +100,7 @@ class Run:
 
 
 @dataclass(slots=True)
-class Judge:
+class TruthJudge:
     """Compares videos of a segment with the truth, if it is known: a scene, or ``light`` (T, n, n)."""
 
     segment: Segment
@@ -109,7 +109,7 @@ class Judge:
     _truths: dict[Voxels, NDArray[np.float32]] = field(default_factory=dict)
 
     @classmethod
-    def of(cls, recording: Recording, segment: Segment, tile: Tile | None = None) -> Judge:
+    def of(cls, recording: Recording, segment: Segment, tile: Tile | None = None) -> TruthJudge:
         """Use the scene that a simulated recording describes; behind a fibre, that of a tile."""
         attrs = recording.attrs
         if not attrs.get("simulated") or "scene" not in attrs:
@@ -218,7 +218,7 @@ def amplitude_error(video: NDArray[Any], truth: NDArray[Any]) -> float | None:
 
 
 def measure(
-    judge: Judge,
+    judge: TruthJudge,
     solver: str,
     voxels: Voxels,
     *,
@@ -226,7 +226,7 @@ def measure(
     longest_s: float | None = None,
     progress: Callable[[int, int], None] | None = None,
     dtype: Dtype = "float32",
-) -> Run:
+) -> TradeoffRun:
     """Reconstruct once and observe intermediate results, with the time so far but without that of observing.
 
     The run is cut after ``longest_s``. Raises UsageError for a dark scene.
@@ -267,7 +267,7 @@ def measure(
     last = Point(result.iterations, result.seconds, result.processor_s, "end", prediction=prediction)
     # an observed result counts the making of its video, and may be later than the end
     earlier = (each for each in points if each.seconds < last.seconds)
-    return Run(
+    return TradeoffRun(
         solver=solver,
         voxels=voxels,
         dtype=dtype,
@@ -279,20 +279,20 @@ def measure(
     )
 
 
-def pareto(runs: Iterable[Run]) -> list[tuple[Run, Point]]:
+def pareto(runs: Iterable[TradeoffRun]) -> list[tuple[TradeoffRun, Point]]:
     """Return the points whose accuracy no other run reaches sooner, in order of time; for equal voxels."""
     everything = sorted(
         ((run, point) for run in runs for point in run.points if point.psnr_db is not None),
         key=lambda each: each[1].seconds,
     )
-    front: list[tuple[Run, Point]] = []
+    front: list[tuple[TradeoffRun, Point]] = []
     for run, point in everything:
         if not front or (point.psnr_db or 0) > (front[-1][1].psnr_db or 0):
             front.append((run, point))
     return front
 
 
-def table(runs: Sequence[Run]) -> list[dict[str, Any]]:
+def table(runs: Sequence[TradeoffRun]) -> list[dict[str, Any]]:
     """Return every observed result as a flat row."""
     kinds = dict.fromkeys((run.case, run.voxels) for run in runs)
     fronts = {

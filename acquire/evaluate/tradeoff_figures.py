@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from numpy.typing import NDArray
 
-    from acquire.evaluate.tradeoff import Point, Run
+    from acquire.evaluate.tradeoff import Point, TradeoffRun
 
     Series = tuple[str, str, str]
 
@@ -58,25 +58,26 @@ METRICS = (
 DECIBELS = METRICS[0]
 
 
-def known(runs: Sequence[Run], metric: Metric) -> bool:
+def known(runs: Sequence[TradeoffRun], metric: Metric) -> bool:
+    """Return whether any run has a value of this metric; without a truth, none has."""
     return any(getattr(run.end, metric.name) is not None for run in runs)
 
 
-def yardstick(runs: Sequence[Run]) -> float | None:
+def yardstick(runs: Sequence[TradeoffRun]) -> float | None:
     """Return the median PSNR of the truth's mean over time; None if unknown, or if the scene is constant."""
     known_db = [run.mean_db for run in runs if run.mean_db is not None]
     return float(np.median(known_db)) if known_db else None
 
 
-def in_series(runs: Sequence[Run]) -> dict[Series, list[Run]]:
+def in_series(runs: Sequence[TradeoffRun]) -> dict[Series, list[TradeoffRun]]:
     """Group runs by solver, preset and dtype, so that repeats are together."""
-    found: dict[Series, list[Run]] = {}
+    found: dict[Series, list[TradeoffRun]] = {}
     for run in runs:
         found.setdefault((run.solver, run.preset, run.dtype), []).append(run)
     return found
 
 
-def curves(runs: Sequence[Run], metric: Metric, clock: Clock) -> Figure:
+def curves(runs: Sequence[TradeoffRun], metric: Metric, clock: Clock) -> Figure:
     """Plot a quantity over time: the median of the repeats, their band, and the end of each run."""
     with mpl.rc_context(STYLE):
         figure = canvas(HEIGHT_IN, WIDTH_IN)
@@ -106,7 +107,7 @@ def curves(runs: Sequence[Run], metric: Metric, clock: Clock) -> Figure:
         return figure
 
 
-def _curve(ax: Axes, repeats: list[Run], metric: Metric, clock: Clock, colour: str) -> None:
+def _curve(ax: Axes, repeats: list[TradeoffRun], metric: Metric, clock: Clock, colour: str) -> None:
     found = band(repeats, metric.name, clock)
     if found is None:
         return
@@ -151,7 +152,7 @@ def _value_axis(ax: Axes, metric: Metric) -> None:
     ax.yaxis.set_minor_formatter(NullFormatter())
 
 
-def frames(run: Run, truth: NDArray[Any] | None) -> Figure:
+def frames(run: TradeoffRun, truth: NDArray[Any] | None) -> Figure:
     """Draw one frame after more and more time of one run, and the same frame of the truth."""
     # Up to five points, evenly spaced in the logarithm of time, including the first and the last.
     wanted = np.geomspace(run.points[0].seconds, run.points[-1].seconds, FRAMES)
@@ -176,7 +177,7 @@ def frames(run: Run, truth: NDArray[Any] | None) -> Figure:
         return figure
 
 
-def white(run: Run, truth: NDArray[Any] | None) -> float:
+def white(run: TradeoffRun, truth: NDArray[Any] | None) -> float:
     """Return the value that the pictures of a run show as white."""
     shown = run.end.frame if truth is None else truth
     assert shown is not None

@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 
     from acquire.evaluate.knees import Clock
     from acquire.evaluate.themed import Drawing
-    from acquire.evaluate.tradeoff import Run
+    from acquire.evaluate.tradeoff import TradeoffRun
     from acquire.evaluate.tradeoff_figures import Metric
     from acquire.recon.segments import Voxels
     from acquire.simulate import Study
@@ -48,7 +48,7 @@ QUANTITIES = ("seconds", "processor_s", "psnr_db", "ssim", "amplitude_error", "f
 
 
 def write_page(
-    runs: Sequence[Run],
+    runs: Sequence[TradeoffRun],
     truths: Truths,
     study: Study | None,
     *,
@@ -111,7 +111,7 @@ def write_page(
 
 
 def _draw(
-    runs: Sequence[Run], shown: Run, truth: NDArray[Any] | None, prefix: str
+    runs: Sequence[TradeoffRun], shown: TradeoffRun, truth: NDArray[Any] | None, prefix: str
 ) -> dict[str, tuple[str, Figure]]:
     """Draw the figures of one case and voxel size: name → description and figure."""
     plots: list[tuple[Metric, str, str, Clock]] = [
@@ -127,7 +127,7 @@ def _draw(
     return drawn | {f"{prefix}-frames": (what, frames(shown, truth))}
 
 
-def _movie(run: Run, truth: NDArray[Any] | None) -> dict[str, Any]:
+def _movie(run: TradeoffRun, truth: NDArray[Any] | None) -> dict[str, Any]:
     """Draw every result of a run, next to the truth if it is known, for the page's player."""
     peak = white(run, truth)
     pictures = [
@@ -141,7 +141,7 @@ def _movie(run: Run, truth: NDArray[Any] | None) -> dict[str, Any]:
     return {"frames": clip.frames, "labels": labels[:: clip.step], "beside": truth is not None}
 
 
-def _still_sentence(runs: Sequence[Run]) -> list[str]:
+def _still_sentence(runs: Sequence[TradeoffRun]) -> list[str]:
     """Compare the runs with the best possible still."""
     mean_db = yardstick(runs)
     if mean_db is None:
@@ -153,7 +153,7 @@ def _still_sentence(runs: Sequence[Run]) -> list[str]:
     return [f"The truth's mean over time, shown as a still, has {mean_db:.0f} dB; {than}."]
 
 
-def _end(repeats: Sequence[Run]) -> dict[str, Any]:
+def _end(repeats: Sequence[TradeoffRun]) -> dict[str, Any]:
     """Summarise where the repeats of a series ended: median, lowest and highest value of each quantity."""
     first = repeats[0]
     found: dict[str, Any] = {

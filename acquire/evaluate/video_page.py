@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from acquire.evaluate.rendering import Look, Panel
+    from acquire.evaluate.rendering import Appearance, Panel
     from acquire.store import VideoFile
 
 MOST_PARTS, MOST_POINTS = 100, 1500
@@ -36,7 +36,7 @@ def write_page(
     times: NDArray[np.int64],
     *,
     path: Path,
-    look: Look,
+    look: Appearance,
     progress: Callable[[int, int], object] | None = None,
 ) -> int:
     """Write a page with the videos side by side at ``times`` (UTC, ns); return the frames in its player.

@@ -39,6 +39,7 @@ class Array:
 
     @property
     def bytes(self) -> int:
+        """Size of all values in memory."""
         return int(np.prod(self.shape)) * self.dtype.itemsize
 
 

@@ -55,7 +55,7 @@ class TdiArm:
         """Return the lines of voxels: (T/T_m, n/N_m, n/N_m) → (L_R, M)."""
         # `np.empty`, because the loops write every element before they add to it
         sheared = np.empty((self.lines_shape[0], self.voxels_shape[2]), self.dtype)
-        shear(voxels, self._code, self._starts, self._lengths, self._S, self._T_m, sheared)
+        shear(voxels, self._code, self._starts, self._lengths, S=self._S, T_m=self._T_m, out=sheared)
         pixels: NDArray[Any] = blocks_to_pixels(sheared, self._n, self._S, self._N_m)
         return pixels
 
@@ -63,5 +63,5 @@ class TdiArm:
         """Apply the transpose: (L_R, M) → (T/T_m, n/N_m, n/N_m)."""
         voxels = np.empty(self.voxels_shape, self.dtype)
         spread = pixels_to_blocks(lines, self._n, self._S, self._N_m)
-        unshear(spread, self._code, self._starts, self._lengths, self._S, self._T_m, voxels)
+        unshear(spread, self._code, self._starts, self._lengths, S=self._S, T_m=self._T_m, out=voxels)
         return voxels

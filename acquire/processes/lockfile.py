@@ -18,6 +18,7 @@ from pathlib import Path
 LONGEST_LOCK = 32
 """Largest lock file, in bytes: a process number and a newline."""
 _AGAIN_S = 0.0005
+"""flock(2) waits without a limit or not at all, so a wait with a limit is a series of attempts."""
 
 
 class LockFile:

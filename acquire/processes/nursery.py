@@ -160,6 +160,7 @@ class Nursery:
 
     @property
     def alive(self) -> bool:
+        """Whether its process runs."""
         return self._process.poll() is None
 
     @property
@@ -218,6 +219,7 @@ class Own:
         self._changing = threading.Lock()
 
     def get(self) -> Nursery:
+        """Return the nursery, a new one if there is none, or it was inherited by a fork, or has died."""
         with self._changing:
             found = self._nursery
             if found is None or found.owner != os.getpid():
@@ -228,6 +230,7 @@ class Own:
             return found
 
     def replace(self, new: Callable[[], Nursery | None]) -> None:
+        """Close the nursery and take the one that ``new`` returns, with no `get` in between."""
         with self._changing:
             if self._nursery is not None:
                 self._nursery.close()
@@ -277,6 +280,7 @@ class Received:
     index: int
 
     def detach(self) -> int:
+        """Return the descriptor's number in this process."""
         return _received[self.index]
 
 

@@ -25,6 +25,7 @@ FIRST, EARLY = 1000, 500
 oom_score_adj.
 """
 _IMPORTANT = -15
+"""Niceness of what others must not keep from running; the service's unit permits as much (LimitNICE)."""
 _SLICE_NS = 100_000
 """The shortest that Linux allows (kernel/sched/syscalls.c), and more than copying a block of lines takes."""
 _SCHED_SETATTR = {"x86_64": 314, "aarch64": 274}

@@ -37,7 +37,9 @@ _KILL_WAIT_S = 10.0
 """Time for the kernel to end a killed process, which takes milliseconds, unless the process waits for a
 disk."""
 _LAST_WORD_S = 0.1
+"""How long the exit code is waited for when a pipe has ended."""
 _LOOK_S = 0.1
+"""Interval at which an ending process is checked for having been stopped by a signal."""
 
 
 class OwnerGone(Exception):  # noqa: N818 - an event, not an error: the child ends in order

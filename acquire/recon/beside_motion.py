@@ -19,7 +19,7 @@ from acquire.recon.admm import Admm
 from acquire.recon.band import segment_operator
 from acquire.recon.bandwidth import FEWEST_COEFFICIENTS
 from acquire.recon.basis import TemporalBasis
-from acquire.recon.joined import JoinedOperator, JoinedPrior, JoinedSign, Layout
+from acquire.recon.joined import JoinedLayout, JoinedOperator, JoinedPrior, JoinedSign
 from acquire.recon.patterns import GAP, PARAMETERS, Patterns, Refinement
 from acquire.recon.sign import SignSplit
 from acquire.recon.tv import FrameTv
@@ -119,11 +119,11 @@ class PatternsAndMotion:
     def other_video(self, found: Patterns) -> NDArray[Any]:
         return host(self._slow.synthesize(found.motion))
 
-    def _layout(self, found: Patterns) -> Layout:
+    def _layout(self, found: Patterns) -> JoinedLayout:
         assert found.motion is not None
         # A voxel's penalty is that of its pixels.
         scale = float(self._given.options.spatial_merge)
-        return Layout(tuple(found.motion.shape), tuple(found.patterns.shape), scale)
+        return JoinedLayout(tuple(found.motion.shape), tuple(found.patterns.shape), scale)
 
 
 def beside_motion(

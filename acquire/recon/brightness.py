@@ -28,6 +28,7 @@ if TYPE_CHECKING:
 START_RIDGE = 1e-3
 """Ridge of the start relative to the mean eigenvalue: it draws g to 1 where no line has information on it."""
 MOST_STEPS = 12
+"""Upper limit on the fixed-point steps of the prior."""
 NEIGHBOURS = 9
 """Number of neighbouring cosines that share their energy: the light of one lamp is rarely in a single one."""
 DIMMEST = 0.02

@@ -26,6 +26,7 @@ LAMPS_SHARE = 0.3
 UNSEARCHED_SHARE = 0.4
 """Share of the budget that posing the problem may take; beyond it, the bandwidth is not searched for."""
 FEW_FRAMES = 32
+"""Largest number of frames that counts as few."""
 HELD_BACK = 100.0
 """Factor of the penalties for few frames unless they explain the lines."""
 STILL_PARAMETERS = AdmmParameters(tv_weight=5e-6, tv_penalty=1e-5, sign_penalty=3e-6, gradient_steps=6)

@@ -42,6 +42,7 @@ RIDGE = 1e-5
 """Ridge relative to the mean eigenvalue: light that no line sees stays unchanged."""
 STEPS = 6
 PLAIN_STEPS = 60
+"""Numbers of steps of conjugate gradients: with the preconditioner of a small problem, and without one."""
 REFRESH = 4
 """Number of calls that share a preconditioner and a prior."""
 EVIDENCE_STEPS = 2
@@ -49,6 +50,7 @@ EVIDENCE_STEPS = 2
 LARGEST_SPAN = 8192
 """Largest number of sub-steps for which the normal matrix is formed; it would take too much memory beyond."""
 LARGEST_UNKNOWNS = 4096
+"""The same for the unknowns, of which the matrix has as many rows."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -46,6 +46,7 @@ class CheckedDenoiser:
         self._denoiser, self._name = denoiser, type(denoiser).__name__
 
     def prox(self, frames: Array, weight: float | Array) -> Array:
+        """Denoise. Raises UsageError for a result of another shape, NumericsError if it is not finite."""
         cleaned = self._denoiser.prox(frames, weight)
         shape = getattr(cleaned, "shape", None)
         if shape != frames.shape:

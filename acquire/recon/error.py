@@ -75,6 +75,7 @@ class Exponents:
 
     @property
     def whole(self) -> NDArray[np.float64]:
+        """The exponents of the whole video's error, in the order of the indicators."""
         exponents = (
             self.constant,
             self.sensitivity,
@@ -305,6 +306,7 @@ def in_regions(frames: NDArray[Any]) -> NDArray[np.float64]:
 
 
 def rms_of(values: NDArray[Any]) -> float:
+    """Return the root mean square of all values, summed in float64 part by part."""
     total = sum(float(np.square(part, dtype=np.float64).sum()) for part in _parts(values))
     return float(np.sqrt(total / values.size))
 

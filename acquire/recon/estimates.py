@@ -34,7 +34,7 @@ class Estimate(Protocol):
     def facts(self) -> dict[str, Any]: ...
 
 
-class Continuation(Protocol):
+class ContinuingSolver(Protocol):
     """A solver that continues an estimate: `step` is an iteration, `video` the dimensionless video so far."""
 
     def step(self) -> None: ...
@@ -48,7 +48,7 @@ class Continuable(Protocol):
 
     def continue_with(
         self, problem: Problem, heavier: float = 1.0, *, still: bool = False
-    ) -> Continuation | None:
+    ) -> ContinuingSolver | None:
         """Continue with a problem's samples and a prior that is ``heavier`` by this factor; None if
         impossible.
 
@@ -97,6 +97,7 @@ class InBand:
         *,
         still: bool = False,  # noqa: ARG002 (the protocol's; nothing here is added to a still)
     ) -> InBand | None:
+        """Return the solver on another problem, from where this one is; None unless it is ADMM."""
         if not isinstance(self.solver, Admm):
             return None
         solver = self.solver.with_problem(problem.masked(self._operator), problem.used_samples, heavier)
@@ -151,7 +152,7 @@ class Preferred:
 
     def continue_with(
         self, problem: Problem, heavier: float = 1.0, *, still: bool = False
-    ) -> Continuation | None:
+    ) -> ContinuingSolver | None:
         if not isinstance(self._estimate, Continuable):
             return None
         return self._estimate.continue_with(problem, heavier, still=still)

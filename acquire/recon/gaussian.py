@@ -28,9 +28,11 @@ FINE, SLOW, FAST = 4, 16, 128
 """Numbers of cosines that are resolved in fine rows, in rows as wide as pixels, and in few rows: sharp edges
 at rest would look like a delay if they fell between blocks."""
 FAST_ROWS = 16
+"""Number of those few rows."""
 EVIDENCE_LINES = 24
 """Length of the blocks of lines in which evidence is counted; their spread gives its uncertainty."""
 SMALLEST = 1e-30
+"""Keeps quotients finite for lines that do not vary."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -140,6 +142,7 @@ class Fit:
 
     @property
     def evidence(self) -> float:
+        """Log likelihood of all lines."""
         return float(self.blocks.sum())
 
 
@@ -157,6 +160,7 @@ class Model:
 
     @classmethod
     def of(cls, response: Response, prior: Prior, pixels: int) -> Model:
+        """Return the model for lines of ``pixels`` pixels, with the eigenvectors of both covariances."""
         covariance = response.covariance(prior)
         # A prior's noise is relative to the light, whose mean variance becomes 1.
         unit = max(float(np.trace(covariance)) / len(covariance), SMALLEST)
@@ -174,6 +178,7 @@ class Model:
         )
 
     def with_noise(self, noise: float) -> Model:
+        """Return the model with other noise, without decomposing the covariances again."""
         changed = replace(self, prior=replace(self.prior, noise=noise))
         changed.__dict__["_level"] = self._level  # modes do not depend on the noise
         return changed
@@ -192,6 +197,7 @@ class Model:
         return len(self._pixel_values)
 
     def modes(self, lines: Floats) -> Floats:
+        """Return lines (line, pixel) in the covariances' eigenvectors, in which samples are independent."""
         return np.asarray(self._vectors.T @ lines @ self._pixel_vectors)
 
     def fit(self, lines: Floats) -> Fit:

@@ -37,6 +37,7 @@ MOST_PIXELS = 64
 MOST_BLOCKS = 192
 """Largest number of row blocks; below it there is one for each fine row."""
 UNKNOWN_BIT = 0.5
+"""Mean of a code bit, in place of one that is not known."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -127,6 +128,7 @@ class Evidence:
 
     @property
     def total(self) -> Floats:
+        """Own and mutual evidence of each block."""
         return self.own + self.mutual
 
 
@@ -167,6 +169,7 @@ class LineModel:
         self._view.cache_clear()
 
     def evidence(self, hypothesis: Hypothesis) -> Evidence:
+        """Return the evidence for a hypothesis: of each arm alone, and of what each predicts of the other."""
         views = [self.view(hypothesis, arm) for arm in (0, 1)]
         own = [view.fits[arm].blocks for arm, view in enumerate(views)]
         turn = hypothesis.turn
@@ -183,6 +186,7 @@ class LineModel:
         return Evidence(np.concatenate(own), np.concatenate(gain))
 
     def view(self, hypothesis: Hypothesis, arm: int) -> FittedArms:
+        """Return the fits of both arms, exposed as the hypothesis says of ``arm``; kept for the next call."""
         substeps = hypothesis.substeps or self.substeps
         return self._view(hypothesis.inverted, hypothesis.late[arm], substeps, hypothesis.random_code)
 

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, slots=True)
-class Layout:
+class JoinedLayout:
     """Where both parts are in one array of a single axis; ``scale`` multiplies the volume."""
 
     volume: Shape
@@ -35,13 +35,16 @@ class Layout:
 
     @property
     def shape(self) -> Shape:
+        """Shape of the joined array."""
         return (math.prod(self.volume) + math.prod(self.patterns),)
 
     def joined(self, volume: Array, patterns: Array) -> Array:
+        """Return both parts in one array; the opposite of `parts`."""
         xp = namespace(volume)
         return xp.concat([xp.reshape(self.scale * volume, (-1,)), xp.reshape(patterns, (-1,))])
 
     def parts(self, theta: Array) -> tuple[Array, Array]:
+        """Return volume and patterns of a joined array; the opposite of `joined`."""
         xp, size = namespace(theta), math.prod(self.volume)
         volume, patterns = xp.reshape(theta[:size], self.volume), xp.reshape(theta[size:], self.patterns)
         return volume / self.scale, patterns
@@ -50,7 +53,7 @@ class Layout:
 class JoinedOperator:
     """B₁·θ₁ + B₂·θ₂ and its transpose."""
 
-    def __init__(self, layout: Layout, volume: Operator, patterns: Operator) -> None:
+    def __init__(self, layout: JoinedLayout, volume: Operator, patterns: Operator) -> None:
         self._layout, self._volume, self._patterns = layout, volume, patterns
 
     def forward(self, theta: Array) -> Array:
@@ -66,7 +69,7 @@ class JoinedOperator:
 class JoinedSign:
     """Neither part is negative: a `SignSplit` of each."""
 
-    def __init__(self, layout: Layout, volume: SignSplit, patterns: SignSplit) -> None:
+    def __init__(self, layout: JoinedLayout, volume: SignSplit, patterns: SignSplit) -> None:
         self._layout, self._volume, self._patterns = layout, volume, patterns
 
     def advance(self, theta: Array) -> None:
@@ -98,7 +101,7 @@ class JoinedPrior:
     """A denoiser of each part; ``weights`` multiply λ/ρ of θ₁ (one) and of θ₂ (one for each frame)."""
 
     def __init__(
-        self, layout: Layout, denoisers: tuple[Denoiser, Denoiser], weights: tuple[float, Array]
+        self, layout: JoinedLayout, denoisers: tuple[Denoiser, Denoiser], weights: tuple[float, Array]
     ) -> None:
         self._layout, self._denoisers, self._weights = layout, denoisers, weights
 

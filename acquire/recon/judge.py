@@ -26,6 +26,7 @@ too."""
 TOO_EARLY = {"stopped": "it was interrupted too early", "budget": "its budget was too short"}
 """What ended the iterations → that cause of a misfit in words, where others are possible."""
 POOR_COVERAGE = 0.8
+"""Share of usable samples below which a video comes with a warning."""
 DENSITY = (0.1, 0.9)
 """Range of the share of lit sub-steps; codes outside leave frames unseen, or make them all alike."""
 

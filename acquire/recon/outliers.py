@@ -23,12 +23,15 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 SPIKE_LINES = 5
+"""Number of lines in the running median: spikes of up to two lines do not change it."""
 SPIKE_DEVIATIONS = 20.0
+"""Height of a spike in robust standard deviations, which adds to `SPIKE_LEVEL`."""
 SPIKE_LEVEL = 0.5
 """Smallest height of a spike, relative to the samples' 99th percentile, so that quiet scenes have none."""
 FENCE = 1.5
 """Distance of a spike from the middle half of its column's samples, in their range (Tukey's inner fences)."""
 HOT_RATIO = 10.0
+"""Ratio of a hot column's median to the usual one, at least."""
 DEFECT_SPREAD = 0.5 / 3**0.5
 """Relative standard deviation of a hot column's lines at most, times √M: light under a random code varies by
 1/√(S·M) if it fills all rows, as a slit, and more if it fills fewer; defects need not vary at all."""

@@ -39,6 +39,7 @@ if TYPE_CHECKING:
     from acquire.recon.problem import MaskedOperator, Operator, Problem
 
 LARGEST_RANK = 12
+"""Largest number of patterns; a scene that takes more is not one of patterns."""
 TAIL = 16
 """Index of the singular value that is taken as the error floor of the first reconstruction."""
 ABOVE_TAIL = 3.0
@@ -270,6 +271,7 @@ class Refinement:
 
     @property
     def rank(self) -> int:
+        """Number of patterns."""
         return int(self.found.curves.shape[1])
 
     @property
@@ -279,6 +281,7 @@ class Refinement:
 
     @property
     def at_round_end(self) -> bool:
+        """Whether the latest iteration was the last one of a round, after which the curves are fitted."""
         return self._steps % ROUND == 0
 
     def step(self) -> None:

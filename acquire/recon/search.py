@@ -23,9 +23,11 @@ DELAYS = (0, 3, -3, 6, -6, 10, -10)
 """Delays in sub-steps to start from, equal for both arms: pictures agree a little when they are this far
 off."""
 FARTHEST_DELAY = 24
+"""Longest delay of an arm that is tried, in sub-steps."""
 RANDOM_CODES = 4
 """Number of random codes that show the agreement by chance."""
 LEAST_CONTRAST = 10.0
+"""Least contrast and gain that are attributed to chance: a few random codes may show too little of it."""
 VERIFIED_ALONE, VERIFIED, BEYOND = 4.0, 2.0, 3.0
 """Agreement of the arms at which a code is verified; the second is enough if the code also explains each
 arm's own lines better than random codes do, by the third in their standard deviations."""
@@ -69,10 +71,12 @@ class WeighedHypothesis:
 
     @property
     def gain(self) -> float:
+        """Mutual evidence: what each arm's lines gain from the other's."""
         return float(self.evidence.mutual.sum())
 
     @property
     def total(self) -> float:
+        """Log likelihood: own and mutual evidence of all lines."""
         return float(self.evidence.total.sum())
 
     @property
@@ -202,6 +206,7 @@ class ByChance:
 
     @classmethod
     def of(cls, model: LineModel, plain: Hypothesis) -> ByChance:
+        """Try `RANDOM_CODES` random codes in place of the code; all else is as in ``plain``."""
         found = [
             _contrast(model, replace(plain, random_code=number)) for number in range(1, RANDOM_CODES + 1)
         ]

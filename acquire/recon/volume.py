@@ -97,7 +97,15 @@ class VolumeTv:
         if is_numpy_array(volume):
             cleaned = np.empty_like(volume)
             clean = volume_prox if volume.size < PARALLEL_VOXELS else volume_prox_parallel
-            clean(volume, weight, self.pace, self.cyclic, self._dual, self.iterations, cleaned)
+            clean(
+                volume,
+                weight,
+                pace=self.pace,
+                cyclic=self.cyclic,
+                dual=self._dual,
+                iterations=self.iterations,
+                out=cleaned,
+            )
         else:
             cleaned = self._prox_of_any(volume, weight)
         cleaned = cleaned if self._path is None else self._path.restore(cleaned)

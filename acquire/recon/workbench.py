@@ -241,7 +241,9 @@ class Workbench:
             if self.clock.spent(SEARCH_SHARE) or not isinstance(basis, CyclicBasis):
                 break
             operator = partial(self._new_operator, None)
-            period, changes = better_speed(self.problem, best.admm.theta, basis, operator, stride, order)
+            period, changes = better_speed(
+                self.problem, best.admm.theta, basis, operator, stride=stride, order=order
+            )
             moved = replace(best.candidate, period_frames=period, speed_changes=changes)
             found = self.attempt(moved, PROBE, best)
             gained = found.error < WORTH_A_ROUND * best.error

@@ -18,7 +18,7 @@ The sub-segments in work bound the memory: the recording is read and the video w
 """
 
 from acquire.recon import reconstruct
-from acquire.reconstruct.combine import Outcome, Watcher, combine
+from acquire.reconstruct.combine import Monitor, Outcome, combine
 from acquire.reconstruct.pools import Pool, open_pool
 from acquire.reconstruct.select import (
     VideoRequest,
@@ -33,11 +33,11 @@ from acquire.reconstruct.single import describe, save_reconstruction
 from acquire.reconstruct.work import Options
 
 __all__ = [
+    "Monitor",
     "Options",
     "Outcome",
     "Pool",
     "VideoRequest",
-    "Watcher",
     "along_plan",
     "by_lines",
     "by_time",

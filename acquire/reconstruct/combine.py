@@ -58,7 +58,7 @@ class Outcome:
     cut: bool = False
 
 
-class Watcher:
+class Monitor:
     """Forwards the progress and requests the stop; ``stopped`` is set once it was requested.
 
     ``progress`` takes (tasks done, number of tasks). ``stop`` is called often and must return at once.
@@ -88,13 +88,13 @@ def combine(
     *,
     options: Options,
     pool: Pool,
-    watcher: Watcher,
+    monitor: Monitor,
     began: float | None = None,
 ) -> Outcome:
     """Reconstruct the ranges of a request and write their video.
 
     ``out`` is a new path or URL. Behind a fibre the tiles of the scene are solved one after the other. If the
-    watcher requests a stop, the part solved so far is written and marked as interrupted. A DataError, or
+    monitor requests a stop, the part solved so far is written and marked as interrupted. A DataError, or
     whatever a sub-segment raises, leaves nothing behind. The options' budget is wall time from ``began``
     (`time.monotonic`; the call if None) to the end of the video. Raises UsageError if it cannot be kept, and
     if both arms have lost all lines of a sub-segment, or no sample of them is usable, before anything is
@@ -119,7 +119,7 @@ def combine(
     budget.check(tasks, request.stream.geometry(1))
     done: list[dict[str, Any]] = []
     with open_sheet(out, request, recording) as sheet:
-        for part, task, following in _solved(tasks, pool, watcher, budget, SharedChoices(sharing)):
+        for part, task, following in _solved(tasks, pool, monitor, budget, SharedChoices(sharing)):
             if len(done) % len(segments) == 0:  # the first sub-segment of a tile
                 stitcher = Stitcher(grid)
             arrived, first = time.monotonic(), stitcher.frames
@@ -133,7 +133,7 @@ def combine(
         if not done:
             raise KeyboardInterrupt  # there is nothing to keep
         facts = describe_parts(recording, request, done, options)
-        cut = len(done) < len(tasks) and not watcher.stopped
+        cut = len(done) < len(tasks) and not monitor.stopped
         # Sub-segments repeat each other's warnings word for word: each is kept once, in order.
         warnings = (
             *warnings,
@@ -142,12 +142,12 @@ def combine(
         )
         facts |= {"balance": balance_facts, "warnings": list(dict.fromkeys(warnings))}
         facts["choice"] = sharing_facts(done) if sharing else None
-        facts["state"] = "interrupted" if cut or watcher.stopped else "complete"
+        facts["state"] = "interrupted" if cut or monitor.stopped else "complete"
         facts["seconds"] = round(time.monotonic() - called, 3)
         trusted = _trusted_of_all_tiles(request, segments, done)
         facts["trusted"] = _trusted_frames(request, sheet.frames, trusted)
         sheet.finish(facts)
-    return Outcome(out, (sheet.frames, *sheet.shape), watcher.stopped, facts, cut)
+    return Outcome(out, (sheet.frames, *sheet.shape), monitor.stopped, facts, cut)
 
 
 def _refuse_lost(recording: Recording, segments: Sequence[SubSegment]) -> None:
@@ -199,9 +199,9 @@ def _refuse_unusable(
 
 
 def _solved(
-    tasks: Sequence[Task], pool: Pool, watcher: Watcher, budget: Budget, choices: SharedChoices
+    tasks: Sequence[Task], pool: Pool, monitor: Monitor, budget: Budget, choices: SharedChoices
 ) -> Iterator[tuple[Part, Task, SubSegment | None]]:
-    """Yield solved tasks in order, each with its tile's next sub-segment, until watcher or budget ends it.
+    """Yield solved tasks in order, each with its tile's next sub-segment, until monitor or budget ends it.
 
     Tasks that share a choice wait for it, so that the video does not depend on which task finishes first.
     """
@@ -209,7 +209,7 @@ def _solved(
     waiting: deque[Future[Part]] = deque()
     for index, task in enumerate(tasks):
         # There is one more than there are workers, so that none of them waits while a part is being written.
-        while submitted < len(tasks) and len(waiting) <= pool.workers and not watcher.stopped:
+        while submitted < len(tasks) and len(waiting) <= pool.workers and not monitor.stopped:
             # The first task always runs, because a video needs one.
             if (submitted and budget.exhausted) or (waiting and choices.pending(tasks[submitted])):
                 break
@@ -217,24 +217,24 @@ def _solved(
             undone = after + 1 + sum(not each.done() for each in waiting)
             waiting.append(pool.submit(budget.limit(choices.with_choice(tasks[submitted]), undone, after)))
             submitted += 1
-        if not waiting or (part := _result(waiting, pool, watcher)) is None:
+        if not waiting or (part := _result(waiting, pool, monitor)) is None:
             return
         choices.record(task, part)
         following = tasks[index + 1 : index + 2]
         yield part, task, following[0].segment if following and following[0].tile == task.tile else None
 
 
-def _result(waiting: deque[Future[Part]], pool: Pool, watcher: Watcher) -> Part | None:
+def _result(waiting: deque[Future[Part]], pool: Pool, monitor: Monitor) -> Part | None:
     """Wait for the first future and return its part; None if it was cancelled."""
     future = waiting.popleft()
     try:
         while not wait([future], POLL_S).done:
-            if watcher(pool.share_done()):
+            if monitor(pool.share_done()):
                 pool.stop()
                 for each in (future, *waiting):
                     each.cancel()
         # Tasks that end sooner than `POLL_S` are reported, too.
-        watcher(pool.share_done())
+        monitor(pool.share_done())
         return future.result()
     except CancelledError:
         return None

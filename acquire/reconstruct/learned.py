@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
 
 VERSION = 2
+"""Version of the file; one of another version counts as empty."""
 FEWEST_SCENES = 3
 """Fewest common scenes with which presets are ranked."""
 

@@ -36,7 +36,9 @@ class Pool(Protocol):
 
     workers: int
 
-    def submit(self, task: Task) -> Future[Part]: ...
+    def submit(self, task: Task) -> Future[Part]:
+        """Return at once with the future result, except for `Here`, which solves the task first."""
+        ...
 
     def share_done(self) -> float:
         """Return the number of tasks done, counting those in progress in part."""

@@ -64,7 +64,9 @@ stays odd this long belongs to a writer that died."""
 class Clock(Protocol):
     """The host's time. Tests supply a clock that they advance themselves."""
 
-    def monotonic_ns(self) -> int: ...
+    def monotonic_ns(self) -> int:
+        """Return ns of CLOCK_MONOTONIC, or of the time that a test advances."""
+        ...
 
     def utc_ns(self) -> int:
         """ns since 1970-01-01T00:00:00 UTC."""
@@ -143,10 +145,12 @@ class WireReading:
 
     @property
     def stopped(self) -> bool:
+        """Whether the latest train has ended."""
         return self.train is not None and self.train.stopped_after is not None
 
     @property
     def running(self) -> bool:
+        """Whether there is a train that has not ended."""
         return self.train is not None and self.train.stopped_after is None
 
 

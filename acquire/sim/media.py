@@ -39,7 +39,7 @@ MAX_PIXELS = 1 << 26
 """Largest size of one frame, before it is resampled."""
 
 
-class Source(Protocol):
+class FrameSource(Protocol):
     """Frames of a file, in order or by number; grey values 0 to 1."""
 
     @property
@@ -126,7 +126,7 @@ class VideoScene:
         return self._kept[index]
 
 
-def open_media(path: Path) -> Source:
+def open_media(path: Path) -> FrameSource:
     """Return the frames of a file, read by the first library that can."""
     # `is_file` is False for what is not there, and raises for what may not be looked at.
     try:
@@ -322,7 +322,7 @@ def _check_size(path: Path, width: int, height: int) -> None:
         )
 
 
-def _open_container(path: Path) -> Source:
+def _open_container(path: Path) -> FrameSource:
     try:
         import av
     except ImportError as error:

@@ -6,10 +6,10 @@
                                ├─▶ Eq. (1) ─▶ [signal] ─▶ K⁻¹ ─▶ [charge] ─▶ K ─▶ [readout] ─▶ DN ─▶ [stream]
     scene ─▶ [image] ────────▶ ┘
 
-The stages in brackets come from `acquire.sim.effects`. With none listed, `Sensor.read` is Eq. (1), a factor,
-an offset and a rounding. The layouts differ in the sensor: ``compact`` has two images side by side on one
-sensor, ``emulated`` a sensor of M·S stages whose raw lines are merged S × S, ``interline`` a coarse sensor
-under the fine scene. Behind a fibre (`acquire.fibre`) the scene is drawn as a square that contains the
+The stages in brackets come from `acquire.sim.effects`. With none listed, `ArmSensor.read` is Eq. (1), a
+factor, an offset and a rounding. The layouts differ in the sensor: ``compact`` has two images side by side on
+one sensor, ``emulated`` a sensor of M·S stages whose raw lines are merged S × S, ``interline`` a coarse
+sensor under the fine scene. Behind a fibre (`acquire.fibre`) the scene is drawn as a square that contains the
 fibre's field; effects act on that image, and the field is then laid out on the sensor.
 """
 
@@ -144,7 +144,7 @@ class ArmSource(ABC):
         """Return ``count`` lines from ``first_line`` on."""
 
 
-class Sensor(ArmSource):
+class ArmSensor(ArmSource):
     """One sensor with one image, or two side by side."""
 
     def __init__(
@@ -218,7 +218,7 @@ class Merged(ArmSource):
     A merged sample is white if any of its raw samples is.
     """
 
-    def __init__(self, raw: Sensor, raw_white_dn: int, substeps: int, converter: Converter) -> None:
+    def __init__(self, raw: ArmSensor, raw_white_dn: int, substeps: int, converter: Converter) -> None:
         self.stages = raw.stages
         self._raw, self._raw_white_dn, self._substeps, self._converter = (
             raw,
@@ -244,7 +244,7 @@ class Merged(ArmSource):
 class Cut(ArmSource):
     """A range of columns of a sensor."""
 
-    def __init__(self, sensor: Sensor, columns: slice) -> None:
+    def __init__(self, sensor: ArmSensor, columns: slice) -> None:
         self.stages = sensor.stages
         self._sensor, self._columns = sensor, columns
 
@@ -323,7 +323,7 @@ def _sensor(
     columns: dict[str, int],
     pixels: int,
     merge: int = 1,
-) -> Sensor:
+) -> ArmSensor:
     """Return a sensor with the images of the arms in ``columns`` (arm → first column)."""
     geometry, scene = bench.geometry, bench.fine_scene()
     setting = Setting(
@@ -354,7 +354,7 @@ def _sensor(
             _image(bench.scene.optics, arm, column, code=code, setting=setting, common=stages, own=own)
         )
     kept = [stage for stage in stages if stage.place not in ("image", "signal")]
-    return Sensor(images, pixels, kept, setting, converter.dtype)
+    return ArmSensor(images, pixels, kept, setting, converter.dtype)
 
 
 def _stages(bench: Bench, setting: Setting) -> list[Stage]:

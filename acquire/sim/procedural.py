@@ -55,7 +55,7 @@ SUBSTEP_HZ = 100e3
 
 
 @dataclass(frozen=True)
-class Camera:
+class CameraNoise:
     """Noise of EMVA 1288's linear model; the brightest sample is ``full_well_e`` electrons."""
 
     full_well_e: float = 1e4
@@ -69,7 +69,7 @@ class Camera:
         return Noise((K, K), (dark, dark))
 
 
-CLEAN = Camera(np.inf, 0.0)
+CLEAN = CameraNoise(np.inf, 0.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,9 +108,11 @@ class Canvas:
         return np.asarray(np.clip(0.5 - distance * self.n, 0, 1), np.float32)
 
     def ball(self, y: float, x: float, radius: float) -> Image:
+        """Return a disc with the centre (y, x)."""
         return self.inside(np.hypot(self.y - y, self.x - x) - radius)
 
     def box(self, y: float, x: float, height: float, width: float) -> Image:
+        """Return a rectangle with the centre (y, x)."""
         return self.inside(np.maximum(abs(self.y - y) - height / 2, abs(self.x - x) - width / 2))
 
     def limb(self, y: float, x: float, angle: float, length: float, width: float) -> Image:
@@ -121,6 +123,7 @@ class Canvas:
 
     @cached_property
     def ground(self) -> Image:
+        """A texture for the background."""
         # drawn when it is first used, after a scene's own numbers: in another order they would be other
         # scenes
         return np.asarray(0.35 + 0.65 * self.texture(0.008, 0.03, 0.1))
@@ -131,11 +134,13 @@ def _over(ground: Image, mask: Image, value: float | Image) -> Image:
 
 
 def bullet(s: Canvas) -> Callable[[int, float], Image]:
+    """A dark block that crosses the textured ground at a constant speed."""
     row = s.rng.uniform(0.3, 0.7)
     return lambda _t, tau: _over(s.ground, s.box(row, -0.05 + 1.1 * tau, 0.052, 0.094), 0.05)
 
 
 def splash(s: Canvas) -> Callable[[int, float], Image]:
+    """A crown that rises and widens, and drops that fly off it."""
     angle, far = np.arctan2(s.y - 0.55, s.x - 0.5), np.hypot(s.y - 0.55, s.x - 0.5)
     phases, drops = (
         s.rng.uniform(0, 2 * np.pi, 4),
@@ -160,12 +165,14 @@ def splash(s: Canvas) -> Callable[[int, float], Image]:
 
 
 def shock(s: Canvas) -> Callable[[int, float], Image]:
+    """A thin bright ring that widens more and more slowly."""
     y, x = s.rng.uniform(0.4, 0.6, 2)
     far = np.hypot(s.y - y, s.x - x)
     return lambda _t, tau: 0.03 + 0.9 * s.inside(abs(far - 0.08 - 0.4 * tau**0.8) - 0.012)
 
 
 def disc(s: Canvas) -> Callable[[int, float], Image]:
+    """A disc with sectors in alternating rings, which makes 0.5 to 0.8 turns."""
     far, angle, start = np.hypot(s.y - 0.5, s.x - 0.5), np.arctan2(s.y - 0.5, s.x - 0.5), s.rng.uniform(0, 6)
     mask, rings = s.inside(far - 0.4), np.floor(far / 0.1)
     turns = s.rng.uniform(0.5, 0.8)
@@ -178,6 +185,7 @@ def disc(s: Canvas) -> Callable[[int, float], Image]:
 
 
 def text(s: Canvas) -> Callable[[int, float], Image]:
+    """Three rows of letters that move to the left."""
     n, letters = s.n, "".join(s.rng.choice(list("ABCDEFGHKLMNPRSTXYZ0123456789"), 14))
     sheet = Pil.new("L", (3 * n, n))
     draw, font = ImageDraw.Draw(sheet), ImageFont.load_default(size=n // 4)
@@ -198,12 +206,14 @@ def text(s: Canvas) -> Callable[[int, float], Image]:
 
 
 def spark(s: Canvas) -> Callable[[int, float], Image]:
+    """A flash of 12 sub-steps in front of a still ground."""
     begin, (y, x) = int(s.rng.uniform(0.42, 0.58) * s.span), s.rng.uniform(0.3, 0.7, 2)
     flash = np.exp(-((s.y - y) ** 2 + (s.x - x) ** 2) / 2 / 0.07**2).astype(np.float32)
     return lambda t, _tau: 0.5 * s.ground + (2.0 * flash if begin <= t < begin + 12 else np.float32(0))
 
 
 def flame(s: Canvas) -> Callable[[int, float], Image]:
+    """A flame: two layers of noise that rise at different speeds, in light that flickers as a whole."""
     fields = [
         gaussian_filter(s.rng.standard_normal((3 * s.n, s.n)), s.n * k, mode="wrap") for k in (0.05, 0.1)
     ]
@@ -221,6 +231,7 @@ def flame(s: Canvas) -> Callable[[int, float], Image]:
 
 
 def flicker(s: Canvas) -> Callable[[int, float], Image]:
+    """A ball that crosses the ground, in light that flickers as a whole."""
     rate = s.rng.uniform(9, 15)
 
     def frame(_t: int, tau: float) -> Image:
@@ -231,6 +242,8 @@ def flicker(s: Canvas) -> Callable[[int, float], Image]:
 
 
 def runner(s: Canvas) -> Callable[[int, float], Image]:
+    """A figure that crosses the ground with swinging arms and legs."""
+
     def frame(_t: int, tau: float) -> Image:
         x, swing, image = 0.1 + 0.8 * tau, 0.7 * np.sin(2 * np.pi * 3 * tau), s.ground * 0.6
         for angle in (swing, -swing):
@@ -243,6 +256,7 @@ def runner(s: Canvas) -> Callable[[int, float], Image]:
 
 
 def traffic(s: Canvas) -> Callable[[int, float], Image]:
+    """Six lanes of cars, some of them in the other direction."""
     cars = s.rng.uniform([0.0, -1, 0.1], [1, 1, 1.0], (6, 3))
 
     def frame(_t: int, tau: float) -> Image:
@@ -272,25 +286,30 @@ def _lamps(s: Canvas, hertz: tuple[float, ...]) -> Callable[[int, float], Image]
 
 
 def leds(s: Canvas) -> Callable[[int, float], Image]:
+    """Three shapes that blink at 5, 2.5 and 1 kHz, and a steady one."""
     return _lamps(s, (5e3, 2.5e3, 1e3))
 
 
 def leds_dot(s: Canvas) -> Callable[[int, float], Image]:
+    """The lamps of `leds`, and a dot that crosses between them."""
     lamps = _lamps(s, (5e3, 2.5e3, 1e3))
     return lambda t, tau: _over(lamps(t, tau), s.ball(0.5, 0.1 + 0.8 * tau, 0.05), 0.8)
 
 
 def fastled(s: Canvas) -> Callable[[int, float], Image]:
+    """Two shapes that blink at 20 and 1 kHz."""
     return _lamps(s, (20e3, 1e3))
 
 
 def still(s: Canvas) -> Callable[[int, float], Image]:
+    """A picture that does not change, with details smaller than a voxel."""
     sharp = (s.texture(0.006, 0.02, 0.07) > 0.5).astype(np.float32)
     image = 0.15 + 0.7 * gaussian_filter(sharp, 0.5)
     return lambda _t, _tau: image
 
 
 def fan(s: Canvas) -> Callable[[int, float], Image]:
+    """A fan with three to five blades, of which 5 to 15 pass a point."""
     far, angle, start = np.hypot(s.y - 0.5, s.x - 0.5), np.arctan2(s.y - 0.5, s.x - 0.5), s.rng.uniform(0, 6)
     blades, rate = int(s.rng.integers(3, 6)), s.rng.uniform(5, 15)
     hub = s.inside(far - 0.38)
@@ -303,6 +322,7 @@ def fan(s: Canvas) -> Callable[[int, float], Image]:
 
 
 def string(s: Canvas) -> Callable[[int, float], Image]:
+    """A string that swings in its first two modes."""
     rate, swing = s.rng.uniform(3, 12), s.rng.uniform(0.04, 0.1)
 
     def frame(_t: int, tau: float) -> Image:
@@ -318,6 +338,7 @@ def string(s: Canvas) -> Callable[[int, float], Image]:
 
 
 def piston(s: Canvas) -> Callable[[int, float], Image]:
+    """A crank on a wheel, and the piston that it moves."""
     rate, (y, x), crank, rod = s.rng.uniform(2.5, 10), (0.6, 0.3), 0.13, 0.45
 
     def frame(_t: int, tau: float) -> Image:
@@ -394,7 +415,7 @@ def record(
     stages: int = 64,
     substeps: int = 3,
     lines: int = 263,
-    camera: Camera = Camera(),
+    camera: CameraNoise = CameraNoise(),
     speed_changes: Sequence[float] = (),
 ) -> Recorded:
     """Return the scene as recorded; ``seed`` determines scene, code and noise (`light` has the rest)."""
@@ -406,7 +427,7 @@ def record(
 
 
 def expose(
-    exact: NDArray[np.float64], geometry: Geometry, code: NDArray[np.uint8], camera: Camera, seed: int
+    exact: NDArray[np.float64], geometry: Geometry, code: NDArray[np.uint8], camera: CameraNoise, seed: int
 ) -> Segment:
     """Return Y of Eq. (1) as the 12-bit lines of a camera."""
     # Not `seed` alone, from which the scene was drawn: noise must not repeat those draws.

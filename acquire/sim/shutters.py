@@ -54,11 +54,11 @@ class ShutteredScene:
 def build_shutter(config: WindowConfig | ChopperConfig, size: int, substep_s: float) -> Shutter:
     """Return the shutter that a configuration describes."""
     if isinstance(config, WindowConfig):
-        return Window(config.phases, size, substep_s)
+        return PhasedWindow(config.phases, size, substep_s)
     return Chopper(config, size, substep_s)
 
 
-class Window:
+class PhasedWindow:
     """A sequence of phases in a loop that begins at sub-step 0."""
 
     def __init__(self, phases: tuple[WindowPhase, ...], size: int, substep_s: float) -> None:
@@ -92,4 +92,11 @@ class Chopper:
     def cover(self, frames: NDArray[np.float32], substeps: NDArray[np.int64]) -> None:
         config = self._config
         turned = ((substeps + 0.5) * (config.rotation_hz * self._substep_s) + config.phase_deg / 360) % 1.0
-        chop(frames, self._angle, self._radius, turned, config.blades, config.open_part)
+        chop(
+            frames,
+            self._angle,
+            self._radius,
+            turned,
+            blades=config.blades,
+            open_part=config.open_part,
+        )

@@ -114,7 +114,7 @@ class _Sprite:
         angle = 2 * np.pi * heading
         places = np.stack([row * self._size, column * self._size, np.cos(angle), np.sin(angle)], axis=1)
         scale = len(self._picture) / (config.size * self._size)
-        paste(frames, self._picture, self._alpha, places, scale, self._reach_texels / scale)
+        paste(frames, self._picture, self._alpha, places, scale=scale, reach=self._reach_texels / scale)
 
     def _turns(self, substeps: NDArray[np.int64], rate_hz: float, phase_deg: float) -> Grid:
         # Without whole turns, beside which the fraction would lose its digits in a long run.

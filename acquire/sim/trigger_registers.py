@@ -55,6 +55,7 @@ class RegisterBank:
         self.code_checked = False
 
     def get(self, register: r.Register) -> int:
+        """Return the value of all words of a register."""
         return sum(self._words[register.address + i] << 32 * i for i in range(register.words))
 
     def put(self, register: r.Register, value: int) -> None:

@@ -8,7 +8,7 @@
       seen at once     overview                   extent shortfall
     videos             video_writer, mosaic_writer (tiles), video_layout (metadata)
     one arm            arm_writer                 camera_stream, present
-    one array          array_writer → shard       stretch → chunks → array_files
+    one array          array_writer → shard       stored_rows → chunks → array_files
     tables             table                      table_reader
     what is written    terms, spec (attributes), layout and shape (metadata), codecs (bytes)
     where              files (disk), pages, host  source → disk | remote (URLs)

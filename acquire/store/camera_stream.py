@@ -9,7 +9,7 @@ import numpy as np
 from acquire.showing import in_words
 from acquire.store.array_files import COLUMNS, ArmFiles
 from acquire.store.chunks import ChunkReader
-from acquire.store.stretch import Stretch
+from acquire.store.stored_rows import StoredRows
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -93,9 +93,9 @@ class CameraStream(ArmFiles):
         """Return the reader of the chunks of the array ``name``."""
         return self._readers[name]
 
-    def stretch(self, name: str, start: int, stop: int) -> Stretch:
+    def stretch(self, name: str, start: int, stop: int) -> StoredRows:
         """Return rows ``start .. stop - 1`` of one array, to be read."""
-        return Stretch(self._readers[name], start, stop, self.first_line)
+        return StoredRows(self._readers[name], start, stop, self.first_line)
 
     def read(self, name: str, start: int, stop: int) -> NDArray[Any]:
         """Read rows ``start .. stop - 1`` of one array. Raises DataError if they are not intact on disk."""

@@ -102,10 +102,12 @@ class Outline:
 
     @property
     def clock(self) -> ClockFit:
+        """Fit of the trigger's clock to UTC, as recorded."""
         return ClockFit.from_attrs(self.attrs["clock"])
 
     @property
     def line_period_ns(self) -> float:
+        """Time from one line to the next, by the trigger's clock as it was fitted."""
         return int(self.attrs["trigger"]["line_period_ticks"]) * NS_PER_S / self.clock.clock_hz
 
     @property

@@ -39,7 +39,7 @@ if TYPE_CHECKING:
     from acquire.store.layout import Document
     from acquire.store.overview import Overview
     from acquire.store.source import Source
-    from acquire.store.stretch import Stretch
+    from acquire.store.stored_rows import StoredRows
 
 CUT_COLUMNS = ("lines", "flags", "code", "code_index", "time")
 """Arrays from which a segment is cut."""
@@ -184,7 +184,7 @@ class Recording(Outline):
         return present_values(self, arm, name, start, flags)
 
     def _times(
-        self, start: int, flags: NDArray[np.uint16], stretches: dict[str, dict[str, Stretch]]
+        self, start: int, flags: NDArray[np.uint16], stretches: dict[str, dict[str, StoredRows]]
     ) -> NDArray[np.int64]:
         """Return the time of each row: of arm A, or of the other arm, or by the clock, if it is missing."""
         try:
@@ -225,7 +225,7 @@ class Recording(Outline):
         """
         return read_overview(self, self.camera(arm).arm)
 
-    def _fetched(self, start: int, stop: int) -> dict[str, dict[str, Stretch]]:
+    def _fetched(self, start: int, stop: int) -> dict[str, dict[str, StoredRows]]:
         """Return, per arm and array, rows ``start .. stop - 1``, all being fetched at once."""
         found = {
             arm: {name: stream.stretch(name, start, stop) for name in CUT_COLUMNS}
@@ -286,7 +286,7 @@ class Recording(Outline):
         first_line: int,
         geometry: Geometry,
         flags: NDArray[np.uint16],
-        stretches: dict[str, dict[str, Stretch]],
+        stretches: dict[str, dict[str, StoredRows]],
     ) -> NDArray[np.uint8]:
         """Return E of the segment from the attributes, after comparing it with the code stored per line."""
         S, lines = geometry.substeps, geometry.lines

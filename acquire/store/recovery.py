@@ -260,9 +260,12 @@ class _Recoverer:
     def _publish(self, new_gaps: dict[str, list[tuple[int, int, str]]]) -> None:
         hidden = self.path / ARMS[0] / "lines"
         publisher = Publisher(hidden / SCRATCH, self.disk)
-        self._complete_directories()
         document = copy.deepcopy(self.recording.document)
         nodes: dict[str, layout.Document] = document["consolidated_metadata"]["metadata"]
+        # Directories that are gone, as of a whole arm, are made anew for the metadata that is written below.
+        for place in (*nodes, f"{ARMS[0]}/lines"):
+            if not (self.path / place).is_dir():
+                self.disk.make_directory(self.path / place, parents=True)
         nodes |= self._tables(publisher, new_gaps)
         # Also into the arms' own metadata, for readers that begin below the root.
         for arm in ARMS:
@@ -286,13 +289,6 @@ class _Recoverer:
             if any(shard in shards for shards in listed):
                 remove(self.disk, self.path, Dropped(shard, listed))
         self.disk.sync_directory(self.path.parent)
-
-    def _complete_directories(self) -> None:
-        """Create the directories that are gone, as of a whole arm: the metadata in them is written anew."""
-        nodes = self.recording.document["consolidated_metadata"]["metadata"]
-        for place in (*nodes, f"{ARMS[0]}/lines"):
-            if not (self.path / place).is_dir():
-                self.disk.make_directory(self.path / place, parents=True)
 
     def _tables(
         self, publisher: Publisher, new_gaps: dict[str, list[tuple[int, int, str]]]

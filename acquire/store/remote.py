@@ -221,6 +221,7 @@ class RemoteSource:
 
     @property
     def has_directories(self) -> bool:
+        """Whether directories exist without files in them, as on a file system."""
         return self.url.partition("://")[0] not in OBJECT_STORES
 
     def _path(self, key: str) -> str:

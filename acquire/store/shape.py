@@ -58,6 +58,7 @@ class ArrayShape:
 
     @property
     def shard_rows(self) -> int:
+        """Rows per file."""
         return self.chunk_rows * self.shard_chunks
 
     @property

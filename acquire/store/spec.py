@@ -127,6 +127,7 @@ class RecordingSpec:
 
     @property
     def line_dtype(self) -> np.dtype[Any]:
+        """Type of a sample on disk, which is little-endian on every host."""
         return np.dtype(self.dtype).newbyteorder("<")
 
     @property

@@ -15,8 +15,8 @@ shared memory: no pixel is sent between a camera's buffer and the recorder, and 
 processes · `grabber`, and `lineclock` after an absence · `tagger` · `window` of lines around an event, those
 `kept` already · `opening` of a recording, `session` · `recorder`, its `recorder_plan` and `recorder_states` ·
 `stalls` · `lightcheck`, `threshold`, `watcher` · `external_counts` of trigger, cameras and watcher · `ledger`
-of every pulse · `plan` · `succession` of killed processes · `lifecycle` of a recording · `supervisor` ·
-`capture`
+of every pulse · `plan` · `succession` of killed processes · `lifecycle` of a recording · `tag_feed` ·
+`supervisor` · `capture`
 """
 
 from acquire.stream.capture import Capture

@@ -46,6 +46,7 @@ _TAG_RING = RingShape(slots=64, rows=256, width=3, dtype="uint64")
 REPORTED_S = 1.0
 """Waits longer than this are reported in the status."""
 _UNDO_S = 5.0
+"""Time to undo an arming that failed, when there is no recording to be sealed."""
 _LEAST_END_S = 5.0
 """Least time for the processes to end, even when time is up: a killed grabber leaves its camera running."""
 

@@ -49,6 +49,7 @@ _MOST_SATURATED = 0.5
 all 156 with shares up to 0.6 were verified, and 48 of the rest: others were called dark, inverted, shifted or
 of another code."""
 _NEVER_ZERO = 1e-12
+"""Keeps quotients finite where nothing varies."""
 
 
 class Verdict(StrEnum):
@@ -81,7 +82,7 @@ class Sight:
 
 
 @dataclass(frozen=True, slots=True)
-class Finding:
+class ArmVerdict:
     """The verdict on one arm; ``shift``: sub-steps by which its lines are late; ``peak``: see the module."""
 
     verdict: Verdict
@@ -93,7 +94,7 @@ class Finding:
         return f"{name} by {self.shift:+d} sub-steps" if self.shift else name
 
 
-def explain(found: dict[str, Finding], substeps: int) -> str:
+def explain(found: dict[str, ArmVerdict], substeps: int) -> str:
     """Return both verdicts in words and, if the arms differ by whole lines, which one is behind."""
     words = ", ".join(f"arm {arm} {finding}" for arm, finding in found.items())
     a, b = found["a"], found["b"]
@@ -124,7 +125,7 @@ class Judge:
     registration: dict[str, int]
     fibre: Fibre | None = None
 
-    def look(self, first_line: int, sights: dict[str, Sight]) -> dict[str, Finding]:
+    def look(self, first_line: int, sights: dict[str, Sight]) -> dict[str, ArmVerdict]:
         """Return the verdict on each arm from the same lines of both, from ``first_line`` on."""
         lines = len(sights["a"].energy)
         reach = min(4096, self.substeps * lines // 4)
@@ -149,16 +150,16 @@ class Judge:
         if not saturated and not any(np.array_equal(code[n:], code[:-n]) for n in range(1, span)):
             return found
         return {
-            arm: finding if finding.verdict is Verdict.VERIFIED else Finding(Verdict.UNKNOWN)
+            arm: finding if finding.verdict is Verdict.VERIFIED else ArmVerdict(Verdict.UNKNOWN)
             for arm, finding in found.items()
         }
 
     def _judge(
         self, sight: Sight, rows: NDArray[np.float64], bits: NDArray[np.uint8], nominal: int
-    ) -> Finding:
+    ) -> ArmVerdict:
         light, least = float(np.nanmean(sight.energy)), _DARK_SHARE * self.white_dn
         # Darkness is expected if the code leaves the light off for all of these lines.
-        dark = Finding(Verdict.DARK if light < least and bits.any() else Verdict.UNKNOWN)
+        dark = ArmVerdict(Verdict.DARK if light < least and bits.any() else Verdict.UNKNOWN)
         # A constant code, or an arm without light, predicts no variation.
         if bits.min() == bits.max() or min(light, rows.mean()) <= 0:
             return dark
@@ -195,7 +196,7 @@ def predict(rows: NDArray[np.float64], bits: NDArray[np.uint8], substeps: int) -
     return energy
 
 
-def _read(peaks: NDArray[np.float64], nominal: int, contrast: float, lines: int) -> Finding:
+def _read(peaks: NDArray[np.float64], nominal: int, contrast: float, lines: int) -> ArmVerdict:
     """Return the verdict. ``contrast``: predicted variation of the light relative to the measured one."""
     at = int(np.abs(peaks).argmax())
     # Noise alone puts the largest peak anywhere: another delay must explain clearly more than the nominal.
@@ -204,11 +205,11 @@ def _read(peaks: NDArray[np.float64], nominal: int, contrast: float, lines: int)
     peak, shift = float(peaks[at]), nominal - at
     if abs(peak) >= CERTAIN:
         straight = Verdict.SHIFTED if shift else Verdict.VERIFIED
-        return Finding(straight if peak > 0 else Verdict.INVERTED, shift, peak)
+        return ArmVerdict(straight if peak > 0 else Verdict.INVERTED, shift, peak)
     if contrast > _FLAT:
-        return Finding(Verdict.DARK, 0, peak)
+        return ArmVerdict(Verdict.DARK, 0, peak)
     certain = min(contrast, 1.0) * np.sqrt(lines) > _MUST_SHOW
-    return Finding(Verdict.WRONG_CODE if certain else Verdict.UNKNOWN, 0, peak)
+    return ArmVerdict(Verdict.WRONG_CODE if certain else Verdict.UNKNOWN, 0, peak)
 
 
 def _transform_size(length: int) -> int:

@@ -92,14 +92,17 @@ class RingShape:
 
     @property
     def control_words(self) -> int:
+        """Words at the beginning of the memory: counters of the ring, then of each observer."""
         return _OBSERVERS + self.observers * _LINE_WORDS
 
     @property
     def flags_offset(self) -> int:
+        """Byte at which the lines' flags begin, after the headers of all slots."""
         return (self.control_words + self.slots * _HEADER_WORDS) * WORD_BYTES
 
     @property
     def pixels_offset(self) -> int:
+        """Byte at which the pixels of the first slot begin: at a page, as those of every slot."""
         return _page_up(self.flags_offset + self.slots * self.rows * 2)
 
     @property

@@ -93,6 +93,7 @@ class Book:
     left_out: int = 0
 
     def store(self, flags: NDArray[np.uint16]) -> None:
+        """Count rows that were stored, with their flags."""
         self.next_line += len(flags)
         self.stored += len(flags)
         if flags.any():
@@ -101,10 +102,12 @@ class Book:
             self.saturated += int(np.count_nonzero(flags & LineFlag.SATURATED))
 
     def miss(self, count: int, cause: Cause) -> None:
+        """Count the next rows as missing."""
         self.next_line += count
         self.missing[cause] += count
 
     def balances(self, lines: int) -> bool:
+        """Return whether each of ``lines`` rows is either stored or missing."""
         return lines == self.stored + self.missing.total()
 
     def end_at(self, line: int, missed: Counter[Cause]) -> int:
@@ -116,6 +119,7 @@ class Book:
         return removed
 
     def to_attrs(self, lines: int) -> dict[str, Any]:
+        """Return the account as JSON values, for a recording of ``lines`` rows."""
         return {
             "stored": self.stored,
             "missing": {str(cause): count for cause, count in self.missing.items()},

@@ -39,6 +39,7 @@ MOST = 5
 _SHORT_S = 60.0
 """A segment that lasts for less shows that the disk is still in trouble."""
 _LONGEST_WAIT_S = 60.0
+"""Upper limit on the wait before an attempt, which doubles as long as attempts fail."""
 READY_S = 120.0
 """How long a successor may take to become ready."""
 

@@ -1,27 +1,25 @@
-"""The thread of an armed run: it moves tags to the recorder, reads the processes' messages, and notices when
-they fall silent.
+"""The thread of an armed run: it moves tags to the recorder (`TagFeed`), reads the processes' messages, and
+notices when they fall silent.
 """
 
 from __future__ import annotations
 
-import contextlib
 import threading
 import time
 from collections import deque
 from typing import TYPE_CHECKING
 
 from acquire.clock import NS_PER_S
-from acquire.errors import AcquireError, DeviceError, TriggerError
+from acquire.errors import DeviceError, TriggerError
 from acquire.lines import ARMS
 from acquire.processes.messages import Failed, Ready
-from acquire.stream.external_counts import RECORDER, TRIGGER, TRIGGER_COUNTERS, WATCHER
+from acquire.stream.external_counts import RECORDER, TRIGGER, WATCHER
 from acquire.stream.lifecycle import UNDER_WAY, Lifecycle, Stage
 from acquire.stream.losses import Cause
 from acquire.stream.messages import Began, Cancel, Checked, End, Extend, Interrupt, Note, Refused, Sealed
 from acquire.stream.stalls import Excess, Heartbeat, HoldUps
 from acquire.stream.succession import Succession, replacement_note
-from acquire.stream.tagger import tag_rows
-from acquire.trigger.base import WATCHDOG
+from acquire.stream.tag_feed import TagFeed
 
 if TYPE_CHECKING:
     from acquire.processes.shared import Counters
@@ -29,7 +27,7 @@ if TYPE_CHECKING:
     from acquire.stream.messages import Begin
     from acquire.stream.plan import CapturePlan
     from acquire.stream.ring import Ring
-    from acquire.trigger.base import LineTag, Trigger
+    from acquire.trigger.base import Trigger
 
 # The thread waits for tags only, and checks everything else in between: a death is noticed this much later.
 _TAG_WAIT_S = 0.02
@@ -39,8 +37,6 @@ sooner."""
 _JOIN_S = 30.0
 # Kept between two polls of the service, tenths of a second: a flood of trigger events must not fill memory.
 _MOST_EVENTS = 1024
-# Queries share the trigger's link with its tags.
-_QUERY_EVERY_S = 1.0
 
 
 class Supervisor:
@@ -66,22 +62,17 @@ class Supervisor:
     ) -> None:
         self.fault: str | None = None
         self.life = Lifecycle(goes_on=plan.goes_on)
-        self._trigger = trigger
         self._workers = workers
         self._succession = succession or Succession({})
-        self._tags = tags
+        self._feed = TagFeed(trigger, tags, counters[TRIGGER], report=self.report, fail=self._fail)
         self._plan = plan
         self._loop = Heartbeat(counters[RECORDER], "turns")
         self._cameras = {arm: Heartbeat(counters[arm], "delivered") for arm in ARMS}
-        self._arms_of = plan.grabbers
         margin, limit_s = plan.margin_lines, plan.stall_timeout_s
         self._excess = {arm: Excess(counters[arm], margin, limit_s) for arm in ARMS if margin is not None}
         self._counters = counters
         self._hold_ups = HoldUps()
-        self._query_s = 0.0
-        self._newest_pulse: int | None = None
-        self._trigger_lost = False
-        self._trigger_heard_s = self._turned_s = time.monotonic()
+        self._turned_s = time.monotonic()
         self._events: deque[Note] = deque(maxlen=_MOST_EVENTS)
         self._dead: set[str] = set()
         self._hung: str | None = None
@@ -114,12 +105,13 @@ class Supervisor:
     @property
     def pulses(self) -> int:
         """Pulses issued by the trigger, according to its tags."""
-        return 0 if self._newest_pulse is None else self._newest_pulse + 1
+        newest = self._feed.newest_pulse
+        return 0 if newest is None else newest + 1
 
     @property
     def trigger_silent_s(self) -> float:
         """Seconds since the trigger's last tag or answer to a query."""
-        return time.monotonic() - self._trigger_heard_s
+        return time.monotonic() - self._feed.heard_s
 
     @property
     def still_s(self) -> float:
@@ -127,7 +119,7 @@ class Supervisor:
         return 0.0 if self._ending.is_set() else time.monotonic() - self._turned_s
 
     def start(self) -> None:
-        self._trigger_heard_s = self._turned_s = time.monotonic()
+        self._feed.heard_s = self._turned_s = time.monotonic()
         self._thread.start()
 
     def end(self) -> None:
@@ -241,8 +233,8 @@ class Supervisor:
                 self._hold_ups.update()
                 self._counters[TRIGGER]["held_up_to_ns"] = round(self._hold_ups.over_s * NS_PER_S)
                 self._counters[TRIGGER]["turned_ns"] = round(begun * NS_PER_S)
-                tags = self._take_tags()
-                self._query_trigger(begun)
+                tags = self._feed.take(_TAG_WAIT_S)
+                self._feed.query(begun)
                 for name, worker in self._workers.items():  # a successor only replaces the value of a key
                     self._read_messages(name, worker)
                     worker.flush()
@@ -260,52 +252,6 @@ class Supervisor:
         except Exception as error:  # noqa: BLE001 - the outermost boundary of the thread: reported as a fault
             self._fail(f"supervisor: {type(error).__name__}: {error}")
 
-    def _take_tags(self) -> list[LineTag]:
-        if self._trigger_lost:
-            return []
-        try:
-            tags = self._trigger.tags(_TAG_WAIT_S)
-        except Exception as error:  # noqa: BLE001 - a fault; a driver's defect must not cost the recording
-            self._trigger_lost = True
-            kind = "" if isinstance(error, AcquireError) else f"{type(error).__name__}: "
-            self._fail(f"trigger: {kind}{error}")
-            return []
-        if tags:
-            self._newest_pulse = tags[-1].line
-            self._trigger_heard_s = time.monotonic()
-        for event in self._trigger.events():
-            self.report(Note(event.line, event.kind, f"tick {event.tick}"))
-            if event.kind == WATCHDOG:  # no line comes any more: a recording that began now would be empty
-                self._trigger_lost = True
-                self._fail(
-                    f"trigger: its watchdog ended the run at line {event.line}, "
-                    "since this host had given no sign of life for too long"
-                )
-        rows = self._tags.shape.rows
-        for at in range(0, len(tags), rows):
-            some = tags[at : at + rows]
-            slot = self._tags.claim(0, len(some))  # the rows are tags, and have no line numbers
-            if slot is None:
-                # The recorder is late. Do not wait for it: later tags confirm the same lines.
-                self._tags.drop(some[0].line, len(some))
-                continue
-            slot.pixels[:] = tag_rows(some)
-            self._tags.commit(slot)
-        return tags
-
-    def _query_trigger(self, now_s: float) -> None:
-        """Publish the trigger's counts."""
-        if self._trigger_lost or now_s < self._query_s:
-            return
-        self._query_s = now_s + _QUERY_EVERY_S
-        # A trigger that cannot answer fails in `_take_tags`, which reports it.
-        with contextlib.suppress(AcquireError):
-            counts = self._trigger.statistics()
-            for name in TRIGGER_COUNTERS:
-                self._counters[TRIGGER][name] = int(counts.get(name, 0))
-            if "link_lost" not in counts:
-                self._trigger_heard_s = time.monotonic()
-
     def _watch(self, now_s: float) -> None:
         """Detect silent arms, which are a fault; during a recording, the recorder judges them."""
         limit_s = self._plan.stall_timeout_s
@@ -316,11 +262,11 @@ class Supervisor:
                 # A camera takes seconds to come back. Until then neither its arm, nor the recorder that waits
                 # for it in an open recording, counts as stalled.
                 self._loop.revive()
-                for arm in self._arms_of.get(name, ()):
+                for arm in self._plan.grabbers.get(name, ()):
                     self._cameras[arm].revive()
                     self._counters[RECORDER].add(f"awaited_{arm}", 1)
         self._watch_recorder(now_s)
-        pulse = self._newest_pulse
+        pulse = self._feed.newest_pulse
         for arm, excess in self._excess.items() if pulse is not None else ():
             if line := excess.update(pulse or 0, now_s):
                 ahead = f"line {line} came with the trigger at line {pulse}"
@@ -371,7 +317,7 @@ class Supervisor:
                 for arm in ARMS:
                     self._counters[WATCHER][f"verdict_{arm}"] = 0
                 why = self._last_words.get(name, death)
-                self.report(Note((self._newest_pulse or 0) + 1, "unwatched", f"watcher: {why}"))
+                self.report(Note((self._feed.newest_pulse or 0) + 1, "unwatched", f"watcher: {why}"))
                 return
             self._fail(f"{worker.name}: {self._last_words.get(name, death)}", name)
 
@@ -399,7 +345,7 @@ class Supervisor:
                 self._news.notify_all()
         worker.end(time.monotonic())  # it is dead: this closes what belonged to it
         self._hung = None
-        for arm in self._arms_of.get(name, ()):
+        for arm in self._plan.grabbers.get(name, ()):
             self._cameras[arm].revive()
         self._loop.revive()
         newest = max(self._counters[arm]["next_line"] for arm in ARMS)
@@ -443,4 +389,4 @@ class Supervisor:
             self.fault = self.fault or text
             self._cancel_if(begins=self.life.on_fault())
             self._news.notify_all()
-        self._workers[RECORDER].post(Interrupt(text, self._arms_of.get(name or "", ())))
+        self._workers[RECORDER].post(Interrupt(text, self._plan.grabbers.get(name or "", ())))

@@ -23,7 +23,7 @@ import numpy as np
 from acquire.flags import ARMS, NO_IMAGE
 from acquire.processes.messages import Ready
 from acquire.store.suspect import DOUBTFUL, VERIFIED
-from acquire.stream.lightcheck import Finding, Judge, Sight, Verdict, explain
+from acquire.stream.lightcheck import ArmVerdict, Judge, Sight, Verdict, explain
 from acquire.stream.messages import Checked, Note
 from acquire.stream.observer import Observer
 from acquire.stream.threshold import Threshold
@@ -92,7 +92,7 @@ class Watcher:
         self._observers = {arm: Observer(ring, OBSERVER) for arm, ring in rings.items()}
         self._threshold = None if plan.threshold is None else Threshold(plan.threshold)
         self._intakes: dict[str, BlockMeans] = {}
-        self._reported = dict.fromkeys(ARMS, Finding(Verdict.UNKNOWN))
+        self._reported = dict.fromkeys(ARMS, ArmVerdict(Verdict.UNKNOWN))
         self._doubted: dict[str, bool | None] = dict.fromkeys(ARMS)
         """Whether doubt was reported last, per arm; None: nothing yet."""
         self._next_s = self._now_s = self._report_s = 0.0
@@ -175,7 +175,7 @@ class Watcher:
             doubtful = any(finding.verdict.doubtful for finding in found.values())
             self._mailbox.post(Checked(first_line, doubtful, explain(found, judge.substeps)))
 
-    def _locate(self, arm: str, finding: Finding, first_line: int) -> None:
+    def _locate(self, arm: str, finding: ArmVerdict, first_line: int) -> None:
         """Report from which line on an arm's code is in doubt, or no longer in doubt.
 
         If lines slip in the middle of a check its verdict may be either, and lines between checks are not

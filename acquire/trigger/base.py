@@ -71,6 +71,7 @@ class TriggerRun:
 
     @property
     def line_period_ticks(self) -> int:
+        """Time from one line to the next, in periods of the trigger's clock."""
         return self.substeps * self.substep_ticks
 
 

@@ -55,10 +55,12 @@ class Register:
 
     @property
     def words(self) -> int:
+        """Number of 32-bit words."""
         return -(-self.width // WORD_BITS)
 
     @property
     def writable(self) -> bool:
+        """Whether the host may write it."""
         return self.access in ("config", "operand", "command")
 
     def __getattr__(self, name: str) -> Field:

@@ -135,6 +135,7 @@ class Decoder:
 
 
 def read_payload(address: int, count: int) -> bytes:
+    """Return the payload of a READ of ``count`` words from ``address`` on."""
     return _ADDRESS_COUNT.pack(address, count)
 
 
@@ -146,6 +147,7 @@ def write_payload(address: int, words: Sequence[int]) -> bytes:
 
 
 def nak_payload(error: int, address: int) -> bytes:
+    """Return the payload of a refusal: the error's code, and the register that it concerns."""
     return _ERROR_ADDRESS.pack(error, address)
 
 

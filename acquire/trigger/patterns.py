@@ -28,6 +28,7 @@ class SquareWave:
         return np.repeat(np.array([1, 0], np.uint8), self.half_substeps)
 
     def frequency_hz(self, clock_hz: int) -> float:
+        """Return the frequency with a trigger's clock of ``clock_hz``."""
         return clock_hz / (2 * self.half_substeps * self.substep_ticks)
 
 

@@ -12,9 +12,11 @@ from typing import NamedTuple
 PROTOCOL_VERSION = 1
 """Version in every frame; a frame with another version is refused with BAD_VERSION."""
 MAX_PAYLOAD = 240
+"""In bytes; with header and CRC, COBS needs a single extra byte for a frame of up to 254."""
 MAX_WORDS = 59
 """Largest number of words of one read or write: the payload is at most 2 + 4·59 = 238 bytes."""
 TIME_BITS = 48
+"""Width of the device's time stamps, which wrap after weeks."""
 
 
 class Command(IntEnum):

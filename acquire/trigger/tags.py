@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from acquire.trigger.dialogue import TagArrival
 
 _NUMBERS = 1 << 16
+"""The device numbers its tags with 16 bits."""
 _RUN_BITS = dict(TAG_FIELDS)["run"]
 _WRAP = 1 << TIME_BITS
 _MOST_EVENTS = 4096

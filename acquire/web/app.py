@@ -37,7 +37,7 @@ from acquire.web.messages import (
     SessionRequest,
     VideoFacts,
 )
-from acquire.web.page_stream import Pages
+from acquire.web.page_stream import OpenPages
 from acquire.web.passing import Passing
 from acquire.web.tokens import COOKIE, TokenFile, Tokens
 
@@ -133,7 +133,7 @@ def build_page(
     api = APIRouter(prefix="/api", responses=WHY_REFUSED)
     answers = Answers()
     api.include_router(routes(Passing(hub), answers))
-    _add_stream(api, Pages(hub))
+    _add_stream(api, OpenPages(hub))
     _add_recordings(api, archive, reading, answers)
     _add_jobs(api, jobs, answers)
     _add_calibration(api, hub, jobs, directory, reading, answers)
@@ -176,7 +176,7 @@ def _add_session(api: APIRouter, guard: Guard, tokens: Tokens | TokenFile, *, se
         return Session(role=role)
 
 
-def _add_stream(api: APIRouter, pages: Pages) -> None:
+def _add_stream(api: APIRouter, pages: OpenPages) -> None:
     @api.get(
         "/live",
         summary="State, news and pictures for a page (acquire.web.frames)",

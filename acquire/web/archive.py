@@ -59,7 +59,9 @@ if TYPE_CHECKING:
 MOST_LISTED = 500
 """Largest number of entries in a list; the newest are listed."""
 MOST_EVENTS = 1000
+"""Number of latest events, and of latest gaps, that the page gets of a recording."""
 MOST_PICTURES = 64
+"""Number of pictures, and of display ranges, kept for the next request."""
 PICTURE_ROWS, PICTURE_COLUMNS = 96, 128
 """Size of one arm's part of a recording's picture."""
 LINES_PER_ROW = 8

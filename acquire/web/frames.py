@@ -22,6 +22,7 @@ HEAD = struct.Struct("<II")
 
 
 def message(header: dict[str, Any], body: bytes = b"") -> bytes:
+    """Return a binary message: the lengths of both parts, the header as JSON, the body."""
     text = json.dumps(header, separators=(",", ":")).encode()
     return HEAD.pack(len(text), len(body)) + text + body
 
@@ -33,6 +34,7 @@ def json_message(kind: str, facts: str) -> bytes:
 
 
 def rows_message(arm: str, rows: Rows, facts: dict[str, Any]) -> bytes:
+    """Return a message with an arm's new rows: their kinds, then lowest and highest values by column."""
     header = {
         "type": "rows",
         "arm": arm,

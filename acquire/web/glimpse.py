@@ -49,7 +49,9 @@ PASSES = 2
 """Number of lines, in multiples of the stages: the scene is sampled in full during the second pass."""
 ITERATIONS = 8
 MOST_PER_S = 4.0
+"""Upper limit on glimpses per second."""
 LOOK_AGAIN_S = 0.5
+"""Pause while there is no run, or too few lines of one."""
 _NICE = 10
 """Other programs take precedence, and lose a tenth of a core if they are busy; at 19 there was no picture."""
 
@@ -119,6 +121,7 @@ class Glimpses:
         )
 
     def reconstruct(self, segment: Segment) -> Reconstruction:
+        """Solve a segment in a fixed number of iterations, without checks and error estimate."""
         sizes = self._sizes
         return reconstruct(
             segment,
@@ -178,6 +181,7 @@ def glimpses(client: Client, is_over: Callable[[], bool]) -> Iterator[bytes]:
 
 
 def main() -> None:
+    """Write glimpses to standard output until standard input is closed, or its owner has ended."""
     os.nice(_NICE)
     over = threading.Event()
 

@@ -78,6 +78,7 @@ class Buckets:
         self._buckets: OrderedDict[str, _Bucket] = OrderedDict()
 
     def has_room(self, key: str) -> bool:
+        """Return whether `take` would succeed now."""
         return self._filled(key).left >= 1
 
     def take(self, key: str) -> bool:
@@ -186,6 +187,7 @@ class Guard:
         return role
 
     def note_wrong(self, address: str) -> None:
+        """Log a wrong token, but not each one of an address that tries many."""
         if self._wrong.take(address):  # others are not worth an entry each
             log.warning("a wrong token from %s", address)
 

@@ -16,7 +16,7 @@ from acquire.errors import StateError
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
 
-    from acquire.daemon.stream import Place
+    from acquire.daemon.stream import StreamPlace
     from acquire.web.hub import Hub
 
 MOST_PAGES = 24
@@ -27,7 +27,7 @@ STATE_S = 0.8
 the time between two statuses (`hub.STATUS_S`), so that no state is sent twice."""
 
 
-class Pages:
+class OpenPages:
     """All pages of one event loop."""
 
     def __init__(self, hub: Hub) -> None:
@@ -44,7 +44,7 @@ class Pages:
     def state(self) -> bytes:
         return self._hub.state_message()
 
-    async def _stream(self, place: Place, *, pictures: bool, glimpses: bool) -> AsyncIterator[bytes]:
+    async def _stream(self, place: StreamPlace, *, pictures: bool, glimpses: bool) -> AsyncIterator[bytes]:
         hub = self._hub
         # Not in `open`: a stream that is never begun would never reach `finally`.
         woken = hub.listen()

@@ -27,7 +27,9 @@ if TYPE_CHECKING:
     from acquire.config.web import WebConfig
 
 NICE = 10
+"""The capture path takes precedence over the page, and so do other programs."""
 IDLE_S = 5
+"""Time between two requests on one connection."""
 # The streams of open pages never end on their own: a longer wait would only delay the end.
 GRACE_S = 1
 # More than the open pages can hold (`page_stream.MOST_PAGES`), which leaves some for their other requests.

@@ -29,7 +29,9 @@ COOKIE = "acquire_session"
 # 192 random bits, which base64 writes as 32 characters: guessing them is hopeless even without a limit.
 _TOKEN_BYTES = 24
 _MOST_BYTES = 4096
+"""More than a file of tokens has: any other file in its place is not read to its end."""
 LOOK_EVERY_S = 1.0
+"""Interval at which the file is looked at for new tokens."""
 
 log = logging.getLogger("acquire.web")
 
@@ -42,9 +44,11 @@ class Tokens:
     viewer: str
 
     def role_of_token(self, token: str) -> Role | None:
+        """Return the role of a token; None for a wrong one."""
         return self._find(token, self._of)
 
     def role_of_cookie(self, cookie: str) -> Role | None:
+        """Return the role of a browser's cookie; None for a wrong one."""
         return self._find(cookie, self.cookie)
 
     def cookie(self, role: Role) -> str:

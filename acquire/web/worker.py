@@ -21,6 +21,7 @@ OWNER = "ACQUIRE_OWNER"
 
 
 def main() -> None:
+    """Become the command in the arguments, which ends with the page that started this process."""
     stand_back(_NICE, FIRST)
     # The page may be killed, and then nobody else ends its jobs.
     final_signal = signal.SIGINT if sys.argv[1] == "calibrate" else signal.SIGKILL

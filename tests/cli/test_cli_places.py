@@ -16,7 +16,7 @@ from s3_server import KEYS, S3Server
 
 from acquire.cli.demo import capture
 from acquire.cli.demo.plan import DemoPlan
-from acquire.cli.journal import Journal
+from acquire.cli.journal import StepJournal
 from acquire.cli.usage import not_installed
 from acquire.errors import NoDaemonError
 from acquire.store import write_video
@@ -267,7 +267,7 @@ def test_a_demo_has_a_socket_wherever_temporary_files_go(
 
     monkeypatch.setattr(capture, "daemon", no_daemon)
     with pytest.raises(NoDaemonError, match="enough"):
-        capture.record(DemoPlan(tmp_path), Journal())
+        capture.record(DemoPlan(tmp_path), StepJournal())
     assert not asked[0].parent.exists()
 
 

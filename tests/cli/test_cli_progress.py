@@ -17,7 +17,7 @@ import pytest
 
 from acquire.cli import progress as module
 from acquire.cli.interrupts import END_NOW, _Presses, interrupts_handled, stop_on_interrupt
-from acquire.cli.progress import Progress, span
+from acquire.cli.progress import ProgressDisplay, span
 
 LIMIT_S = 30.0
 
@@ -41,7 +41,7 @@ def heard(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -
 
 
 def test_a_pipe_gets_lines_with_share_and_time_left(heard: Callable[[int], list[str]]) -> None:
-    with Progress("verifying run.zarr") as progress:
+    with ProgressDisplay("verifying run.zarr") as progress:
         assert re.fullmatch(r"acquire: verifying run\.zarr, \d s", heard(1)[0])
         progress._began_s -= 100
         progress.advance(25, 100)
@@ -53,14 +53,14 @@ def test_a_pipe_gets_lines_with_share_and_time_left(heard: Callable[[int], list[
 
 
 def test_short_work_shows_no_progress(capsys: pytest.CaptureFixture[str]) -> None:
-    with Progress("looking") as progress:
+    with ProgressDisplay("looking") as progress:
         progress.advance(1, 2)
     assert capsys.readouterr().err == ""
 
 
 def test_programs_get_json(heard: Callable[[int], list[str]], monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sys, "argv", ["acquire", "verify", "--json"])
-    with Progress("verifying") as progress:
+    with ProgressDisplay("verifying") as progress:
         progress._began_s -= 10
         progress.advance(1, 2)
         facts = json.loads(heard(2)[-1])["progress"]
@@ -69,15 +69,15 @@ def test_programs_get_json(heard: Callable[[int], list[str]], monkeypatch: pytes
 
 
 def test_work_within_work_is_shown_in_its_place(heard: Callable[[int], list[str]]) -> None:
-    with Progress("the demo"):
+    with ProgressDisplay("the demo"):
         heard(1)
-        with Progress("recording"):
+        with ProgressDisplay("recording"):
             assert "the demo" not in heard(3)[-1]
         assert heard(3)[-1].startswith("acquire: the demo, ")
 
 
 def test_long_work_is_announced_once_with_a_faster_alternative(capsys: pytest.CaptureFixture[str]) -> None:
-    with Progress("reconstructing", "--preview") as progress:
+    with ProgressDisplay("reconstructing", "--preview") as progress:
         progress._began_s -= 100  # of compiling, which comes once
         progress.advance(1, 1000)
         progress.advance(2, 1000)
@@ -96,7 +96,10 @@ def test_durations_are_shown_in_words(seconds: float, words: str) -> None:
 
 
 def test_a_terminal_gets_a_bar() -> None:
-    code = "from acquire.cli.progress import Progress\nwith Progress('verifying') as p: p.advance(30, 40)"
+    code = (
+        "from acquire.cli.progress import ProgressDisplay\n"
+        "with ProgressDisplay('verifying') as p: p.advance(30, 40)"
+    )
     parent, child = pty.openpty()
     try:
         subprocess.run(

@@ -339,7 +339,7 @@ def test_a_clock_that_is_set_back_hides_no_slow_lines(
             return super().now(tz) + timedelta(hours=1)
 
     with monkeypatch.context() as clock:
-        clock.setattr("acquire.daemon.service.datetime", Ahead)
+        clock.setattr("acquire.daemon.states.datetime", Ahead)
         daemon.arm()
     names = {check.name for check in daemon.health().checks}
     assert {"rate a", "rate b"} <= names

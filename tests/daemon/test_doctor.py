@@ -20,10 +20,10 @@ import acquire
 from acquire.config import RigConfig
 from acquire.daemon import doctor
 from acquire.daemon.disk_watch import disk_watch
-from acquire.daemon.doctor import Finding, examine
+from acquire.daemon.doctor import CheckResult, examine
 
 
-def found(rig: RigConfig | None, name: str, running: str | None = None) -> Finding:
+def found(rig: RigConfig | None, name: str, running: str | None = None) -> CheckResult:
     (one,) = [one for one in examine(rig, running) if one.name == name]
     return one
 

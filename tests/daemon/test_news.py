@@ -26,7 +26,7 @@ from acquire.daemon.states import State
 from acquire.daemon.stream import ALIVE, MOST_STREAMS, Streams
 from acquire.errors import StateError
 from acquire.stream.messages import Note
-from acquire.web.page_stream import MOST_PAGES, Pages
+from acquire.web.page_stream import MOST_PAGES, OpenPages
 
 
 def arm_status(lost: int = 0, fill: int = 0, verdict: str = "verified", **more: Any) -> ArmStatus:
@@ -264,7 +264,7 @@ def test_places_of_streams_are_taken_at_once_and_given_back_with_them() -> None:
 
 
 def test_places_of_pages_are_taken_at_once() -> None:
-    pages = Pages(cast("Any", None))
+    pages = OpenPages(cast("Any", None))
     kept = [pages.open(pictures=False, glimpses=False) for _ in range(MOST_PAGES)]
     with pytest.raises(StateError, match="24 pages are open already"):
         pages.open(pictures=False, glimpses=False)

@@ -14,7 +14,7 @@ from acquire.evaluate.report import (
     DemoResult,
     Region,
     RigFacts,
-    Stage,
+    TimedStep,
     evaluate_solver,
 )
 from acquire.geometry import Geometry
@@ -106,9 +106,9 @@ def make_result() -> DemoResult:
         ),
         regions=regions,
         stages=(
-            Stage("Start the daemon", 1.314),
-            Stage("Record", 0.923, "20 003 lines"),
-            Stage("Evaluate", 41),
+            TimedStep("Start the daemon", 1.314),
+            TimedStep("Record", 0.923, "20 003 lines"),
+            TimedStep("Evaluate", 41),
         ),
         host=Busyness(cores=2, load=3.14, share=0.63, least_share=0.41),
     )

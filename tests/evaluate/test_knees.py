@@ -6,15 +6,15 @@ import numpy as np
 import pytest
 
 from acquire.evaluate.knees import Band, band, knees, plain, sentences
-from acquire.evaluate.tradeoff import Point, Run
+from acquire.evaluate.tradeoff import Point, TradeoffRun
 from acquire.recon.segments import Voxels
 
 
-def run(*answers: tuple[float, float], ended: str = "converged", repeat: int = 0) -> Run:
+def run(*answers: tuple[float, float], ended: str = "converged", repeat: int = 0) -> TradeoffRun:
     points = tuple(
         Point(number, seconds, seconds / 2, psnr_db=value) for number, (seconds, value) in enumerate(answers)
     )
-    return Run("admm", Voxels(3, 1), "float32", 9, points, ended=ended, repeat=repeat)
+    return TradeoffRun("admm", Voxels(3, 1), "float32", 9, points, ended=ended, repeat=repeat)
 
 
 def curve(*values: float) -> Band:
@@ -55,13 +55,13 @@ def test_a_knee_is_where_doubling_the_time_stops_paying():
         (run((1, 10), (8, 42), (16, 37)), "best after 8.0 s with 42 dB; continuing to 16 s loses 5 dB"),
     ],
 )
-def test_sentences_say_what_time_buys(made: Run, said: str):
+def test_sentences_say_what_time_buys(made: TradeoffRun, said: str):
     assert any(said in sentence for sentence in sentences([made])), sentences([made])
 
 
 def test_no_sentence_without_a_known_truth():
     points = (Point(1, 1.0), Point(2, 2.0))
-    assert sentences([Run("admm", Voxels(3, 1), "float32", 9, points)]) == []
+    assert sentences([TradeoffRun("admm", Voxels(3, 1), "float32", 9, points)]) == []
 
 
 def test_seconds_have_two_digits_and_no_exponent():

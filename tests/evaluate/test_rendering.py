@@ -10,7 +10,7 @@ import pytest
 from PIL import Image
 
 from acquire.errors import DataError, UsageError
-from acquire.evaluate.rendering import Look, Panel, common_times, render
+from acquire.evaluate.rendering import Appearance, Panel, common_times, render
 from acquire.store import open_video, write_video
 
 START = np.int64(1_700_000_000_000_000_000)
@@ -37,7 +37,7 @@ def written(tmp_path, name, video, interval_ns=1000, begin=0, **provenance):
 
 
 def test_a_sheet_shows_frames_and_times(tmp_path):
-    render([panel(tmp_path, "a", 10, 1000)], tmp_path / "s.png", Look(panel_px=48), 4)
+    render([panel(tmp_path, "a", 10, 1000)], tmp_path / "s.png", Appearance(panel_px=48), 4)
     with Image.open(tmp_path / "s.png") as sheet:
         values = np.asarray(sheet.convert("L"))
     assert values.shape[1] >= 4 * 48
@@ -45,7 +45,7 @@ def test_a_sheet_shows_frames_and_times(tmp_path):
 
 
 def test_a_movie_has_the_frames_that_were_asked_for(tmp_path):
-    shown = render([panel(tmp_path, "a", 50, 1000)], tmp_path / "m.mp4", Look(panel_px=96), 25)
+    shown = render([panel(tmp_path, "a", 50, 1000)], tmp_path / "m.mp4", Appearance(panel_px=96), 25)
     with av.open(tmp_path / "m.mp4") as movie:
         frames = [frame.to_ndarray(format="gray") for frame in movie.decode(video=0)]
     assert len(frames) == shown == 25
@@ -54,7 +54,7 @@ def test_a_movie_has_the_frames_that_were_asked_for(tmp_path):
 
 @pytest.mark.parametrize("suffix", [".gif", ".webp"])
 def test_animations(tmp_path, suffix):
-    render([panel(tmp_path, "a", 6, 1000)], tmp_path / f"m{suffix}", Look(panel_px=48), 6)
+    render([panel(tmp_path, "a", 6, 1000)], tmp_path / f"m{suffix}", Appearance(panel_px=48), 6)
     with Image.open(tmp_path / f"m{suffix}") as animation:
         assert animation.n_frames == 6
 
@@ -73,7 +73,10 @@ def test_tiles_that_were_not_reached_are_black_and_the_others_as_usual(tmp_path,
     video = np.full((6, 12, 24), 0.5, np.float32)
     video[:, 0, 0] = 1
     video[:, :, 12:] = np.nan
-    assert render([written(tmp_path, "v", video, trusted=[0, 0])], tmp_path / f"r{suffix}", Look(48), 6) > 0
+    assert (
+        render([written(tmp_path, "v", video, trusted=[0, 0])], tmp_path / f"r{suffix}", Appearance(48), 6)
+        > 0
+    )
     if suffix == ".png":
         with Image.open(tmp_path / "r.png") as sheet:
             values = np.asarray(sheet.convert("L"))
@@ -83,15 +86,15 @@ def test_tiles_that_were_not_reached_are_black_and_the_others_as_usual(tmp_path,
 
 def test_a_video_of_which_nothing_was_reached_is_black(tmp_path):
     video = np.full((3, 12, 12), np.nan, np.float32)
-    assert render([written(tmp_path, "v", video, trusted=[0, 0])], tmp_path / "r.png", Look(48), 3) == 3
+    assert render([written(tmp_path, "v", video, trusted=[0, 0])], tmp_path / "r.png", Appearance(48), 3) == 3
 
 
 def test_impossible_renderings_are_refused(tmp_path):
     one = panel(tmp_path, "a", 5, 1000)
     with pytest.raises(UsageError, match=r"\.mp4"):
-        render([one], tmp_path / "m.avi", Look(), 5)
+        render([one], tmp_path / "m.avi", Appearance(), 5)
     with pytest.raises(UsageError, match="no time in common"):
-        render([one, panel(tmp_path, "b", 5, 1000, begin=10**9)], tmp_path / "m.gif", Look(), 5)
+        render([one, panel(tmp_path, "b", 5, 1000, begin=10**9)], tmp_path / "m.gif", Appearance(), 5)
 
 
 def test_a_damaged_video_is_refused_and_leaves_no_file(tmp_path):
@@ -100,5 +103,5 @@ def test_a_damaged_video_is_refused_and_leaves_no_file(tmp_path):
         if file.is_file():
             os.truncate(file, file.stat().st_size // 2)
     with pytest.raises(DataError, match=r"frames 0 to 0 of .*a\.zarr.* cannot be read: .*; try: a copy"):
-        render([found], tmp_path / "s.png", Look(panel_px=48), 4)
+        render([found], tmp_path / "s.png", Appearance(panel_px=48), 4)
     assert not (tmp_path / "s.png").exists()

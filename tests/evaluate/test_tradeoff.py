@@ -16,7 +16,7 @@ from acquire.config.scene import SineDrive
 from acquire.errors import UsageError
 from acquire.evaluate.cases import full_wells, procedural
 from acquire.evaluate.host import Busyness
-from acquire.evaluate.tradeoff import Judge, Point, Run, amplitude_error, measure, pareto, table
+from acquire.evaluate.tradeoff import Point, TradeoffRun, TruthJudge, amplitude_error, measure, pareto, table
 from acquire.evaluate.tradeoff_page import write_page
 from acquire.recon.segments import Voxels
 from acquire.sim.leds import LedConfig, LedSceneConfig
@@ -40,7 +40,7 @@ def judge(tmp_path_factory):
     path = tmp_path_factory.mktemp("t") / "r.zarr"
     simulate(rig, LedSceneConfig(kind="leds", title="one", leds=(led,)), path, 160)
     recording = open_recording(path)
-    return Judge.of(recording, recording.cut(20, 120))
+    return TruthJudge.of(recording, recording.cut(20, 120))
 
 
 @pytest.fixture(scope="module")
@@ -79,7 +79,7 @@ def test_the_end_of_a_run_has_the_time_of_its_solver_alone(judge, monkeypatch):
 
 
 def test_a_real_recording_has_no_truth(judge):
-    blind = measure(Judge(judge.segment, None), "admm", VOXELS, preset="fast")
+    blind = measure(TruthJudge(judge.segment, None), "admm", VOXELS, preset="fast")
     assert blind.end.psnr_db is None
     assert 0 < blind.end.prediction < 1
     assert blind.end.frame is not None
@@ -87,7 +87,7 @@ def test_a_real_recording_has_no_truth(judge):
 
 def test_a_dark_segment_is_refused_before_it_is_reconstructed(judge, monkeypatch):
     monkeypatch.setattr("acquire.evaluate.tradeoff.reconstruct", None)
-    dark = Judge(judge.segment, None, np.zeros(judge.segment.geometry.video_shape(1, 1), np.float32))
+    dark = TruthJudge(judge.segment, None, np.zeros(judge.segment.geometry.video_shape(1, 1), np.float32))
     with pytest.raises(UsageError, match="dark in the frames of lines 20 to 139"):
         measure(dark, "admm", VOXELS)
 
@@ -96,7 +96,7 @@ def test_the_truth_of_the_baseline_is_in_its_own_pixels_and_sub_steps(tmp_path):
     rig = load_rig("rig-interline", {"geometry.stages": 12})
     simulate(rig, load_scene("scene-usaf-interline"), tmp_path / "r.zarr", 100)
     recording = open_recording(tmp_path / "r.zarr")
-    judge = Judge.of(recording, recording.cut(20, 60))
+    judge = TruthJudge.of(recording, recording.cut(20, 60))
     geometry = judge.segment.geometry
     true = judge.truth(Voxels(1, 1))
     assert true.shape == (len(range(geometry.span)[geometry.trusted]), 12, 12)
@@ -132,8 +132,8 @@ def point(iterations, seconds, decibel):
 
 
 def test_the_front_holds_results_that_nothing_reaches_sooner():
-    slow = Run("twist", VOXELS, "float32", 9, (point(1, 1.0, 5.0), point(2, 9.0, 30.0)))
-    fast = Run("admm", VOXELS, "float32", 9, (point(1, 2.0, 20.0), point(2, 4.0, 19.0)))
+    slow = TradeoffRun("twist", VOXELS, "float32", 9, (point(1, 1.0, 5.0), point(2, 9.0, 30.0)))
+    fast = TradeoffRun("admm", VOXELS, "float32", 9, (point(1, 2.0, 20.0), point(2, 4.0, 19.0)))
     assert [(each.solver, at.iterations) for each, at in pareto([slow, fast])] == [
         ("twist", 1),
         ("admm", 1),

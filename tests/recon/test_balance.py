@@ -12,10 +12,10 @@ from acquire.lines import Segment
 from acquire.recon import reconstruct
 from acquire.recon.balance import balance_of, divided
 from acquire.recon.diagnosis import diagnose
-from acquire.sim.procedural import BLACK_DN, CLEAN, SCENES, Camera, record
+from acquire.sim.procedural import BLACK_DN, CLEAN, SCENES, CameraNoise, record
 
 SIZES = {"stages": 24, "lines": 120}
-DIM = Camera(1e3)
+DIM = CameraNoise(1e3)
 
 
 def split(segment: Segment, ratio: float) -> Segment:
@@ -27,7 +27,7 @@ def split(segment: Segment, ratio: float) -> Segment:
 
 @pytest.mark.parametrize(("seed", "camera"), [(811, CLEAN), (812, DIM)], ids=["clean", "dim"])
 @pytest.mark.parametrize("scene", SCENES)
-def test_equal_arms_are_never_corrected(scene: str, seed: int, camera: Camera) -> None:
+def test_equal_arms_are_never_corrected(scene: str, seed: int, camera: CameraNoise) -> None:
     found = balance_of([record(scene, seed, camera=camera, **SIZES).segment])
     assert found is not None
     assert not found.clear

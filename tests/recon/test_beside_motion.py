@@ -20,7 +20,7 @@ from acquire.recon.band import band_operator
 from acquire.recon.basis import LearnedBasis, TemporalBasis
 from acquire.recon.beside_motion import beside_motion, find_lamps
 from acquire.recon.clock import IterationClock
-from acquire.recon.joined import JoinedOperator, JoinedPrior, JoinedSign, Layout
+from acquire.recon.joined import JoinedLayout, JoinedOperator, JoinedPrior, JoinedSign
 from acquire.recon.patterns import ROUND
 from acquire.recon.problem import build_problem
 from acquire.recon.sign import SignSplit
@@ -29,7 +29,7 @@ from acquire.recon.volume import VolumeTv
 from acquire.sim.procedural import CLEAN, record
 
 GEOMETRY = Geometry(stages=4, substeps=3, lines=20)
-LAYOUT = Layout((5, 4, 4), (3, 12, 12), 3.0)
+LAYOUT = JoinedLayout((5, 4, 4), (3, 12, 12), 3.0)
 RNG = np.random.default_rng(0)
 
 

@@ -20,7 +20,7 @@ from acquire.recon.cycle import better_speed, find_period
 from acquire.recon.problem import build_problem
 from acquire.recon.reuse import Choice
 from acquire.recon.volume import VolumeTv
-from acquire.sim.procedural import Camera, Recorded, record
+from acquire.sim.procedural import CameraNoise, Recorded, record
 
 STAGES, LINES, VOXEL = 32, 160, 3
 
@@ -263,7 +263,7 @@ def test_motion_that_does_not_repeat_is_no_cycle(scene: str) -> None:
 
 
 def test_a_cycle_is_handed_over_to_the_next_part() -> None:
-    dim = record("fan", 51, stages=STAGES, lines=LINES, camera=Camera(2e3))
+    dim = record("fan", 51, stages=STAGES, lines=LINES, camera=CameraNoise(2e3))
     found = reconstruct(dim.segment, VOXEL, 1)
     choice = Choice.of(found)
     assert choice is not None

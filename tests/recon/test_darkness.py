@@ -18,7 +18,7 @@ from acquire.recon.band import band_operator
 from acquire.recon.basis import LearnedBasis, TemporalBasis
 from acquire.recon.darkness import LitPixels, gains_darkness, lit_pixels, with_light_missing
 from acquire.recon.patterns import PATTERNS_ALONE, Patterns
-from acquire.sim.procedural import Camera, record
+from acquire.sim.procedural import CameraNoise, record
 
 GEOMETRY = Geometry(stages=8, substeps=3, lines=60)
 N = GEOMETRY.size
@@ -105,7 +105,7 @@ def test_only_more_darkness_is_tried() -> None:
 
 
 def test_lamps_in_noise_gain_by_a_dark_ground(monkeypatch: pytest.MonkeyPatch) -> None:
-    recorded = record("leds", 84, stages=32, lines=160, camera=Camera(1e4))
+    recorded = record("leds", 84, stages=32, lines=160, camera=CameraNoise(1e4))
     truth = recorded.truth(3, 1)
 
     def quality() -> tuple[float, dict[str, Any]]:

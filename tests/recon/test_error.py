@@ -28,7 +28,7 @@ from acquire.recon.error import (
     regions_of,
 )
 from acquire.showing import error_in_words
-from acquire.sim.procedural import CLEAN, Camera, Recorded, record
+from acquire.sim.procedural import CLEAN, CameraNoise, Recorded, record
 
 EVERY = slice(None)
 
@@ -177,8 +177,8 @@ def test_errors_of_sub_segments_are_combined() -> None:
     assert error_in_words(unknown) == "unknown: the video is dark"
 
 
-@pytest.mark.parametrize("camera", [CLEAN, Camera()], ids=["clean", "1e4"])
-def test_a_still_finer_than_pixels_is_judged_by_its_prior(camera: Camera) -> None:
+@pytest.mark.parametrize("camera", [CLEAN, CameraNoise()], ids=["clean", "1e4"])
+def test_a_still_finer_than_pixels_is_judged_by_its_prior(camera: CameraNoise) -> None:
     """Its lines are explained to a part in a thousand while the picture is some percent off."""
     made = record("still", 72, stages=24, lines=120, camera=camera)
     result = reconstruct(made.segment, 2, 8, "fast")

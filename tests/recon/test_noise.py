@@ -12,7 +12,7 @@ from acquire.errors import UsageError
 from acquire.lines import merged
 from acquire.noise import Noise
 from acquire.recon import Quality, reconstruct
-from acquire.sim.procedural import Camera, record
+from acquire.sim.procedural import CameraNoise, record
 
 NOISE = Noise((0.4, 0.2), (3.0, 5.0))
 
@@ -46,7 +46,7 @@ def test_impossible_noise_is_refused(bad: float) -> None:
 
 
 def test_merged_and_swapped_arms_keep_their_noise() -> None:
-    segment = record("still", 1, stages=12, substeps=1, lines=24, camera=Camera(1e4)).segment
+    segment = record("still", 1, stages=12, substeps=1, lines=24, camera=CameraNoise(1e4)).segment
     whole = replace(segment, noise=NOISE, lines=segment.lines.astype(np.float64), mask=segment.mask | True)
     summed = merged(whole, 3).variance()
     each = whole.variance()
@@ -76,7 +76,7 @@ def test_standings(misfit: float, prediction: float, noise: float, standing: str
 
 def test_a_still_is_explained_and_text_in_motion_is_not() -> None:
     def standing(scene: str) -> str:
-        segment = record(scene, 77, stages=32, lines=100, camera=Camera(1e4)).segment
+        segment = record(scene, 77, stages=32, lines=100, camera=CameraNoise(1e4)).segment
         return reconstruct(segment, 3, 3, "fast").quality.standing
 
     assert standing("still") in ("explained", "nearly explained")

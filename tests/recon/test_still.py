@@ -11,10 +11,10 @@ from acquire.recon.admm import Admm, AdmmParameters
 from acquire.recon.band import band_operator
 from acquire.recon.basis import TemporalBasis
 from acquire.recon.problem import build_problem
-from acquire.sim.procedural import CLEAN, Camera, Recorded, record
+from acquire.sim.procedural import CLEAN, CameraNoise, Recorded, record
 
 
-def scene(name: str, seed: int, camera: Camera = CLEAN) -> Recorded:
+def scene(name: str, seed: int, camera: CameraNoise = CLEAN) -> Recorded:
     return record(name, seed, stages=24, lines=140, camera=camera)
 
 
@@ -23,8 +23,10 @@ def db(video: np.ndarray, whole: Recorded, merge: int) -> float:
     return psnr(np.broadcast_to(video, truth.shape), truth)
 
 
-@pytest.mark.parametrize(("camera", "gain_db"), [(CLEAN, 10), (Camera(1e4), 0.5)])
-def test_a_still_with_detail_below_the_voxel_is_solved_in_fine_pixels(camera: Camera, gain_db: float) -> None:
+@pytest.mark.parametrize(("camera", "gain_db"), [(CLEAN, 10), (CameraNoise(1e4), 0.5)])
+def test_a_still_with_detail_below_the_voxel_is_solved_in_fine_pixels(
+    camera: CameraNoise, gain_db: float
+) -> None:
     whole = scene("still", 41, camera)
     span = whole.segment.geometry.span
     coarse = reconstruct(whole.segment, 3, span, "fast", check=False)
@@ -58,7 +60,7 @@ def test_an_object_before_a_still_keeps_it() -> None:
 def test_a_change_is_tried_from_a_still_that_no_search_improves(monkeypatch: pytest.MonkeyPatch) -> None:
     """It was left out: boxes on a road with little light lost 1 dB, with two codes of three."""
     monkeypatch.setattr(choose, "best_still", lambda still, trials, merge: still)
-    whole = record("traffic", 71, stages=16, lines=100, camera=Camera(1e3))
+    whole = record("traffic", 71, stages=16, lines=100, camera=CameraNoise(1e3))
     result = reconstruct(whole.segment, 3, 4, "fast", check=False, error=False)
     assert any(each.get("change") for each in result.parameters["candidates"])
     assert result.parameters["change"] or result.parameters["ground"]

@@ -12,7 +12,7 @@ from acquire.calibrate import Calibration
 from acquire.calibrate.columns import dark, flat
 from acquire.calibrate.exposure import open_exposure
 from acquire.recon.segments import Voxels
-from acquire.reconstruct import Options, Watcher, by_lines, combine, in_voxels, open_pool
+from acquire.reconstruct import Monitor, Options, by_lines, combine, in_voxels, open_pool
 from acquire.sim.leds import LedSceneConfig
 from acquire.store import open_recording
 
@@ -38,9 +38,9 @@ def provenance(path: Path, out: Path, calibration: Calibration | None = None) ->
     request = in_voxels(by_lines(recording, 0, 90), Voxels(3, 12))
     options = Options("fast", iterations=5, calibration=calibration, check=False)
     tasks = len(request.stretches)
-    watcher = Watcher(tasks)
-    with open_pool(tasks, 1, None, watcher) as pool:
-        return combine(recording, request, out, options=options, pool=pool, watcher=watcher).provenance
+    monitor = Monitor(tasks)
+    with open_pool(tasks, 1, None, monitor) as pool:
+        return combine(recording, request, out, options=options, pool=pool, monitor=monitor).provenance
 
 
 def test_a_balance_found_in_the_lines_is_corrected_and_reported(split: Path, tmp_path: Path) -> None:

@@ -18,8 +18,8 @@ from acquire.errors import UsageError
 from acquire.recon.judge import POOR_MISFIT
 from acquire.recon.segments import Voxels
 from acquire.reconstruct import (
+    Monitor,
     Options,
-    Watcher,
     along_plan,
     by_lines,
     by_time,
@@ -39,9 +39,9 @@ QUICK = Options(iterations=16)
 
 def run(recording_path, request, path, options=QUICK, workers=1, stop=None):
     recording = open_recording(recording_path)
-    watcher = Watcher(len(request.stretches), stop=stop)
-    with open_pool(len(request.stretches), workers, watch=watcher) as pool:
-        return combine(recording, request, path, options=options, pool=pool, watcher=watcher)
+    monitor = Monitor(len(request.stretches), stop=stop)
+    with open_pool(len(request.stretches), workers, watch=monitor) as pool:
+        return combine(recording, request, path, options=options, pool=pool, monitor=monitor)
 
 
 @pytest.fixture
@@ -186,10 +186,10 @@ def test_a_budget_that_began_long_ago_is_refused_and_nothing_written(
     recording_path, request_of_three, tmp_path
 ):
     recording, began = open_recording(recording_path), time.monotonic() - 30
-    path, options, watcher = tmp_path / "v.zarr", Options(budget_s=20), Watcher(3)
+    path, options, monitor = tmp_path / "v.zarr", Options(budget_s=20), Monitor(3)
     refused = pytest.raises(UsageError, match=r"budget of 20 s .*: these 3 sub-segments need at least 3\d s")
     with open_pool(3, 1) as pool, refused:
-        combine(recording, request_of_three, path, options=options, pool=pool, watcher=watcher, began=began)
+        combine(recording, request_of_three, path, options=options, pool=pool, monitor=monitor, began=began)
     assert list(tmp_path.iterdir()) == []
 
 
@@ -221,7 +221,7 @@ def test_a_budget_on_a_busy_machine_keeps_the_results_so_far(recording_path, req
             tmp_path / "v.zarr",
             options=options,
             pool=stalled,
-            watcher=Watcher(3),
+            monitor=Monitor(3),
         )
     facts = open_video(tmp_path / "v.zarr").attrs["provenance"]
     assert outcome.cut
@@ -243,11 +243,11 @@ def test_progress_never_exceeds_the_whole_despite_trials(recording_path, tmp_pat
     """Iterations of trials come on top of the requested ones."""
     request = in_voxels(by_lines(open_recording(recording_path), 20, 60), Voxels(3, 20))
     seen = []
-    watcher = Watcher(len(request.stretches), lambda done, tasks: seen.append(done / tasks))
-    with open_pool(len(request.stretches), 1, watch=watcher) as pool:
+    monitor = Monitor(len(request.stretches), lambda done, tasks: seen.append(done / tasks))
+    with open_pool(len(request.stretches), 1, watch=monitor) as pool:
         recording, options = open_recording(recording_path), Options(iterations=8)
         outcome = combine(
-            recording, request, tmp_path / "v.zarr", options=options, pool=pool, watcher=watcher
+            recording, request, tmp_path / "v.zarr", options=options, pool=pool, monitor=monitor
         )
     assert outcome.provenance["iterations"] > outcome.provenance["iterations_asked"]
     assert seen == sorted(seen)

@@ -16,7 +16,7 @@ from acquire.noise import Noise
 from acquire.recon import reconstruct
 from acquire.recon.reuse import Choice
 from acquire.recon.segments import Voxels
-from acquire.reconstruct import Options, Outcome, Watcher, by_lines, combine, in_tiles, in_voxels, open_pool
+from acquire.reconstruct import Monitor, Options, Outcome, by_lines, combine, in_tiles, in_voxels, open_pool
 from acquire.reconstruct.liveliest import energies
 from acquire.sim.leds import LedConfig, LedSceneConfig
 from acquire.sim.scenes import build_scene
@@ -56,12 +56,12 @@ def recording(rig: RigConfig, scene: LedSceneConfig, tmp_path_factory: pytest.Te
 
 
 def combined(
-    recording: Recording, out: Path, voxels: Voxels, tiles: tuple[Tile, ...], watcher: Watcher | None = None
+    recording: Recording, out: Path, voxels: Voxels, tiles: tuple[Tile, ...], monitor: Monitor | None = None
 ) -> Outcome:
     request = in_tiles(in_voxels(by_lines(recording), voxels, longest=60), tiles)
-    watcher = watcher or Watcher(len(request.stretches) * len(tiles))
-    with open_pool(1, watch=watcher) as pool:
-        return combine(recording, request, out, options=OPTIONS, pool=pool, watcher=watcher)
+    monitor = monitor or Monitor(len(request.stretches) * len(tiles))
+    with open_pool(1, watch=monitor) as pool:
+        return combine(recording, request, out, options=OPTIONS, pool=pool, monitor=monitor)
 
 
 def truth(rig: RigConfig, scene: LedSceneConfig, substeps: np.ndarray) -> np.ndarray:
@@ -98,11 +98,11 @@ def test_a_video_of_all_tiles_shows_the_whole_scene(
 
 def test_each_tile_searches_separately_if_requested(recording: Recording, tmp_path: Path) -> None:
     request = in_tiles(in_voxels(by_lines(recording), Voxels(6, 153)), recording.fibre.tiles[:2])
-    watcher = Watcher(2)
-    with open_pool(1, watch=watcher) as pool:
+    monitor = Monitor(2)
+    with open_pool(1, watch=monitor) as pool:
         options = replace(OPTIONS, shared=False)
         outcome = combine(
-            recording, request, tmp_path / "v.zarr", options=options, pool=pool, watcher=watcher
+            recording, request, tmp_path / "v.zarr", options=options, pool=pool, monitor=monitor
         )
     assert outcome.provenance["choice"] is None
     assert [part["kept_choice"] for part in outcome.provenance["segments"]] == [None, None]
@@ -160,9 +160,9 @@ def test_a_part_equals_the_whole_there_and_states_its_position(recording: Record
 
 def test_an_interrupted_video_has_holes_and_trusts_nothing(recording: Recording, tmp_path: Path) -> None:
     begun: list[float] = []
-    watcher = Watcher(12, stop=lambda: bool(begun) and begun[-1] > 4.5)
-    watcher._progress = lambda done, _: begun.append(done)
-    outcome = combined(recording, tmp_path / "v.zarr", Voxels(2, 4), recording.fibre.tiles, watcher)
+    monitor = Monitor(12, stop=lambda: bool(begun) and begun[-1] > 4.5)
+    monitor._progress = lambda done, _: begun.append(done)
+    outcome = combined(recording, tmp_path / "v.zarr", Voxels(2, 4), recording.fibre.tiles, monitor)
     assert outcome.interrupted
     video = open_video(tmp_path / "v.zarr")
     image = np.asarray(video.video[:])

@@ -11,7 +11,7 @@ import pytest
 from acquire.recon import reconstruct
 from acquire.recon.denoisers import HaarShrink
 from acquire.recon.segments import Voxels
-from acquire.reconstruct import Options, Watcher, by_lines, combine, in_voxels, open_pool, save_reconstruction
+from acquire.reconstruct import Monitor, Options, by_lines, combine, in_voxels, open_pool, save_reconstruction
 from acquire.store import open_recording, open_video
 
 if TYPE_CHECKING:
@@ -115,8 +115,8 @@ def test_an_unknown_error_is_nan_as_in_stitched_videos(recording_path: Path, tmp
 def test_a_stitched_video_records_them_by_the_same_names(recording_path: Path, tmp_path: Path) -> None:
     recording = open_recording(recording_path)
     request = in_voxels(by_lines(recording, 0, LINES), Voxels(*MERGES))
-    options, watcher = Options(iterations=3, denoiser="haar", check=False, error=False), Watcher(1)
-    with open_pool(1, 1, watch=watcher) as pool:
-        combine(recording, request, tmp_path / "v.zarr", options=options, pool=pool, watcher=watcher)
+    options, monitor = Options(iterations=3, denoiser="haar", check=False, error=False), Monitor(1)
+    with open_pool(1, 1, watch=monitor) as pool:
+        combine(recording, request, tmp_path / "v.zarr", options=options, pool=pool, monitor=monitor)
     provenance = open_video(tmp_path / "v.zarr").attrs["provenance"]
     assert (provenance["solver"], provenance["denoiser"], provenance["plugins"]) == ("admm", "haar", [])

@@ -16,8 +16,8 @@ from acquire.recon import reconstruct
 from acquire.recon.segments import Voxels
 from acquire.recon.unseen import Unseen, find_unseen, longest, remaining, within
 from acquire.reconstruct import (
+    Monitor,
     Options,
-    Watcher,
     by_lines,
     combine,
     describe,
@@ -54,9 +54,9 @@ def spoiled(source: Path, path: Path, lines: range, arms: str = "a", *, lost: bo
 def video_of(recording: Recording, path: Path, lines: int = 300, longest: int = 200) -> Outcome:
     request = in_voxels(by_lines(recording, 20, lines), Voxels(4, 2), longest=longest)
     options = Options(iterations=2, check=False, error=False, solver="twist")
-    watcher = Watcher(len(request.stretches))
-    with open_pool(len(request.stretches), 1, watch=watcher) as pool:
-        return combine(recording, request, path, options=options, pool=pool, watcher=watcher)
+    monitor = Monitor(len(request.stretches))
+    with open_pool(len(request.stretches), 1, watch=monitor) as pool:
+        return combine(recording, request, path, options=options, pool=pool, monitor=monitor)
 
 
 @pytest.mark.parametrize(("arm", "lost", "why"), [("a", False, "saturated"), ("b", True, "lost")])

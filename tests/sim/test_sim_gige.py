@@ -76,12 +76,12 @@ def ask(
 
 def write(host: socket.socket, camera: GigeCamera, address: str, name: str, value: int) -> int:
     body = struct.pack(">I", protocol.BOOTSTRAP_BYTES + REGISTERS[name]) + struct.pack("<Q", value)
-    return ask(host, camera, address, protocol.Command.WRITE_MEMORY, body)[0]
+    return ask(host, camera, address, protocol.GvcpCommand.WRITE_MEMORY, body)[0]
 
 
 def read(host: socket.socket, camera: GigeCamera, address: str, name: str) -> int:
     body = struct.pack(">IHH", protocol.BOOTSTRAP_BYTES + REGISTERS[name], 0, 8)
-    status, answer = ask(host, camera, address, protocol.Command.READ_MEMORY, body)
+    status, answer = ask(host, camera, address, protocol.GvcpCommand.READ_MEMORY, body)
     assert status == 0
     return struct.unpack_from("<Q", answer, 4)[0]
 
@@ -108,15 +108,15 @@ def test_values_that_no_line_can_be_sent_with_are_refused_and_change_nothing() -
     with bench(41, tap) as (host, camera, address):
         for name, value in BAD_VALUES:
             before = read(host, camera, address, name)
-            assert write(host, camera, address, name, value) == protocol.Status.INVALID_PARAMETER
+            assert write(host, camera, address, name, value) == protocol.GvcpStatus.INVALID_PARAMETER
             assert read(host, camera, address, name) == before
         beyond = struct.pack(">IHH", 1 << 30, 0, 8)
         for command, body, status in (
-            (protocol.Command.READ_MEMORY, beyond, protocol.Status.INVALID_ADDRESS),
-            (protocol.Command.WRITE_MEMORY, beyond, protocol.Status.INVALID_ADDRESS),
-            (protocol.Command.READ_REGISTER, beyond[:4], protocol.Status.INVALID_ADDRESS),
-            (protocol.Command.WRITE_REGISTER, beyond, protocol.Status.INVALID_ADDRESS),
-            (protocol.Command.WRITE_REGISTER, b"", protocol.Status.INVALID_PARAMETER),
+            (protocol.GvcpCommand.READ_MEMORY, beyond, protocol.GvcpStatus.INVALID_ADDRESS),
+            (protocol.GvcpCommand.WRITE_MEMORY, beyond, protocol.GvcpStatus.INVALID_ADDRESS),
+            (protocol.GvcpCommand.READ_REGISTER, beyond[:4], protocol.GvcpStatus.INVALID_ADDRESS),
+            (protocol.GvcpCommand.WRITE_REGISTER, beyond, protocol.GvcpStatus.INVALID_ADDRESS),
+            (protocol.GvcpCommand.WRITE_REGISTER, b"", protocol.GvcpStatus.INVALID_PARAMETER),
         ):
             assert ask(host, camera, address, command, body) == (status, b"")
         assert write(host, camera, address, "Height", HEIGHT) == 0
@@ -129,11 +129,11 @@ def test_a_request_that_is_cut_off_and_packets_without_room_do_not_end_the_camer
     tap = Tap()
     with bench(43, tap) as (host, camera, address):
         for flags in (1, 0x11):  # frame ids of 16 bits, and of 64
-            packet = struct.pack(">BBHHH", protocol.KEY, flags, protocol.Command.RESEND, 4, 1) + bytes(4)
+            packet = struct.pack(">BBHHH", protocol.KEY, flags, protocol.GvcpCommand.RESEND, 4, 1) + bytes(4)
             host.sendto(packet, (address, protocol.PORT))
             camera.turn()
         size = struct.pack(">II", protocol.PACKET_SIZE, protocol.IP_AND_UDP_BYTES + 8)
-        assert ask(host, camera, address, protocol.Command.WRITE_REGISTER, size)[0] == 0
+        assert ask(host, camera, address, protocol.GvcpCommand.WRITE_REGISTER, size)[0] == 0
         assert write(host, camera, address, "Height", HEIGHT) == 0
         assert write(host, camera, address, "AcquisitionStart", 1) == 0
         while not tap.frames:

@@ -12,7 +12,7 @@ from acquire.sim.digits import DigitScene, DisplayConfig
 from acquire.sim.drives import mean_drive
 from acquire.sim.scene import ArrayScene, SeparableScene, SumScene, frames_at
 from acquire.sim.scenes import build_scene
-from acquire.sim.shutters import Chopper, ShutteredScene, Window
+from acquire.sim.shutters import Chopper, PhasedWindow, ShutteredScene
 from acquire.sim.targets import bar_width_mm, line_pairs_per_mm, usaf_bars, usaf_picture
 
 SCENES = sorted(path.stem for path in builtin_directory().glob("scene-*.toml"))
@@ -115,7 +115,7 @@ def test_a_window_slides_and_opens():
             ],
         }
     )
-    scene = ShutteredScene(ArrayScene(np.ones((1, 40, 40))), [Window(config.phases, 40, DT)])
+    scene = ShutteredScene(ArrayScene(np.ones((1, 40, 40))), [PhasedWindow(config.phases, 40, DT)])
     frames = scene.frames(0, 30)
     np.testing.assert_array_equal(frames[10:15], 1)
     np.testing.assert_allclose(frames[:15], frames[15:], atol=1e-5)

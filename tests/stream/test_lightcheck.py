@@ -13,7 +13,7 @@ from acquire.config import load_rig, load_scene
 from acquire.forward import DualArm
 from acquire.geometry import Geometry
 from acquire.sim.pipeline import Bench
-from acquire.stream.lightcheck import Finding, Judge, Sight, Verdict, explain, predict
+from acquire.stream.lightcheck import ArmVerdict, Judge, Sight, Verdict, explain, predict
 
 LINES, FIRST = 8192, 1000
 SCENES = {
@@ -57,7 +57,7 @@ def sights(lines: dict[str, np.ndarray]) -> dict[str, Sight]:
     return {arm: Sight(pixels.mean(axis=1), pixels.mean(axis=0)) for arm, pixels in lines.items()}
 
 
-def verdicts(scene: str, **altered: object) -> dict[str, Finding]:
+def verdicts(scene: str, **altered: object) -> dict[str, ArmVerdict]:
     """On lines that are held against another code than the light's."""
     lines, stages, substeps, white, code = recorded(scene)
     judge = Judge(stages, substeps, Altered(code, **altered), white, {})
@@ -102,7 +102,7 @@ def test_an_arm_that_slipped_by_lines_is_distinguished_from_the_other(scene: str
     )
 
 
-def overexposed(gain: float, late: int) -> tuple[dict[str, Finding], dict[str, float]]:
+def overexposed(gain: float, late: int) -> tuple[dict[str, ArmVerdict], dict[str, float]]:
     """Verdicts on light that is ``gain`` times too bright, and its share in saturated samples."""
     lines, stages, substeps, white, code = recorded("scene-leds")
     clipped = {arm: np.minimum(gain * pixels, white) for arm, pixels in lines.items()}

@@ -24,10 +24,10 @@ from acquire.evaluate.paper import page as paper_page
 from acquire.evaluate.paper.comparison import Row, captured, faster, finer, same, statement
 from acquire.evaluate.paper.drawing import strip
 from acquire.evaluate.paper.studio import PaperFigure, Picture, Studio
-from acquire.evaluate.rendering import Look, Panel, render
+from acquire.evaluate.rendering import Appearance, Panel, render
 from acquire.evaluate.report import write_report
 from acquire.evaluate.themed import SOLVER_COLOURS, STYLE, THEORY, canvas
-from acquire.evaluate.tradeoff import Point, Run
+from acquire.evaluate.tradeoff import Point, TradeoffRun
 from acquire.recon.segments import Voxels
 from acquire.store import open_video
 from acquire.store.video_layout import VideoGrid
@@ -95,7 +95,7 @@ def demo(directory: Path) -> Path:
 def tradeoff(directory: Path) -> Path:
     truth, rng = blob(9, 24)[4], np.random.default_rng(3)
 
-    def run(solver: str, slow: float, repeat: int, *, cut: bool = False) -> Run:
+    def run(solver: str, slow: float, repeat: int, *, cut: bool = False) -> TradeoffRun:
         points = tuple(
             Point(
                 number,
@@ -109,7 +109,7 @@ def tradeoff(directory: Path) -> Path:
             for number in range(9)
         )
         ended = "budget" if cut else "done"
-        return Run(
+        return TradeoffRun(
             solver, VOXELS, "float32", 9, points, case="a <square>", repeat=repeat, ended=ended, mean_db=17
         )
 
@@ -178,7 +178,7 @@ def video(directory: Path) -> Path:
             writer.finish({"trusted": [4, frames], "recording": "run.zarr", **SOLVED})
         panels.append(Panel(name, open_video(made)))
     page = directory / "index.html"
-    render(panels, page, Look(), 300)
+    render(panels, page, Appearance(), 300)
     return page
 
 

@@ -274,3 +274,4 @@ def usual_parameters(frame_period_s: float) -> dict[str, Value]:
 _PACKET_TIMEOUT_US, _FRAME_RETENTION_US = 20_000, 100_000
 """Aravis' defaults."""
 _MOST_US = 2**32 - 1
+"""Aravis holds both in 32 bits, without a sign."""

@@ -20,7 +20,7 @@ from acquire.cli.demo.plan import (
     trigger_settings,
 )
 from acquire.cli.durations import seconds
-from acquire.cli.journal import Journal
+from acquire.cli.journal import StepJournal
 from acquire.cli.output import JsonFlag, print_facts, print_json
 from acquire.cli.places import make_directory
 
@@ -104,7 +104,7 @@ def demo(
 
     # Fails if it was made since the check: nobody else's directory is filled.
     make_directory(plan.out)
-    journal = Journal()
+    journal = StepJournal()
     if rig.trigger.driver == "rtl":
         compile_gateware(rig, journal)
     result = analyse(plan, record(plan, journal), rig, journal)

@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 
     from acquire.cli.demo.capture import Captured
     from acquire.cli.demo.plan import DemoPlan
-    from acquire.cli.journal import Journal
+    from acquire.cli.journal import StepJournal
     from acquire.config import RigConfig
     from acquire.lines import Segment
 
@@ -52,7 +52,7 @@ class Method:
     budget_s: float | None
 
 
-def analyse(plan: DemoPlan, captured: Captured, rig: RigConfig, journal: Journal) -> DemoResult:
+def analyse(plan: DemoPlan, captured: Captured, rig: RigConfig, journal: StepJournal) -> DemoResult:
     """Return everything that the report shows; write the truth and the videos to ``plan.out``."""
     recording = open_recording(captured.path)
     with journal.stage("Cut both arms") as note:
@@ -118,7 +118,7 @@ def analyse(plan: DemoPlan, captured: Captured, rig: RigConfig, journal: Journal
     )
 
 
-def _solve(method: Method, segment: Segment, journal: Journal) -> Reconstruction:
+def _solve(method: Method, segment: Segment, journal: StepJournal) -> Reconstruction:
     name = f"Reconstruct: {method.label}"
     with journal.stage(name) as note, stage_progress(name) as advance:
         result = reconstruct(

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from acquire.cli.demo.plan import DemoPlan
-    from acquire.cli.journal import Journal
+    from acquire.cli.journal import StepJournal
     from acquire.config import RigConfig
     from acquire.daemon.messages import Status
 
@@ -43,7 +43,7 @@ class Captured:
     seconds: float
 
 
-def record(plan: DemoPlan, journal: Journal) -> Captured:
+def record(plan: DemoPlan, journal: StepJournal) -> Captured:
     """Start a daemon, arm, record, and end the daemon again; its log goes to daemon.log."""
     log, path = plan.out / LOG, plan.out / "recording.zarr"
     with private_directory() as directory:
@@ -75,7 +75,7 @@ def record(plan: DemoPlan, journal: Journal) -> Captured:
     return captured
 
 
-def compile_gateware(rig: RigConfig, journal: Journal) -> None:
+def compile_gateware(rig: RigConfig, journal: StepJournal) -> None:
     """Compile the gateware before arming, which would otherwise wait for it, and report the clock rate."""
     from acquire.sim import rtl
 

@@ -15,7 +15,7 @@ from acquire.evaluate.metrics import psnr, ssim
 from acquire.evaluate.paper.comparison import Row
 from acquire.recon import reconstruct
 from acquire.recon.segments import Voxels
-from acquire.reconstruct import Options, Watcher, along_plan, combine, in_voxels, open_pool
+from acquire.reconstruct import Monitor, Options, along_plan, combine, in_voxels, open_pool
 from acquire.reconstruct.select import Selection, by_lines
 from acquire.sim.effects.charge import ReadNoise, ShotNoise
 from acquire.sim.voxels import truth
@@ -93,6 +93,7 @@ class Shot:
         return (first + np.arange(len(self.video))) * (self.segment.substep_ns * 1e-6)
 
     def numbers(self) -> dict[str, float]:
+        """Return PSNR in dB and SSIM against the truth."""
         return {"psnr_db": psnr(self.video, self.truth), "ssim": ssim(self.video, self.truth)}
 
     def accuracy(self) -> Row:
@@ -194,15 +195,15 @@ class Studio:
     def _combine(self, recording: Recording, request: VideoRequest, name: str, what: str) -> Outcome:
         self._begin(what)
         began = time.perf_counter()
-        watcher = Watcher(len(request.stretches))
-        with open_pool(len(request.stretches), watch=watcher) as pool:
+        monitor = Monitor(len(request.stretches))
+        with open_pool(len(request.stretches), watch=monitor) as pool:
             outcome = combine(
                 recording,
                 request,
                 self.directory / name,
                 options=self.options,
                 pool=pool,
-                watcher=watcher,
+                monitor=monitor,
             )
         self._end(what, time.perf_counter() - began)
         return outcome

@@ -26,7 +26,7 @@ _IDLE_S = 0.001
 _BLOCK_WAIT_S = 0.01
 
 
-class Sensor(Protocol):
+class LineSource(Protocol):
     """The source of a camera's lines: `acquire.sim.devices.SimulatedCamera`, or a test's own."""
 
     def arm(self) -> None: ...
@@ -40,7 +40,7 @@ class Sensor(Protocol):
 
 def feed(mailbox: Mailbox, memory: CameraMemory, opener: Callable[[], Any]) -> None:
     """Main function of a feeder: follow the host's start and stop requests and pass on lines."""
-    sensor: Sensor = opener()
+    sensor: LineSource = opener()
     mailbox.post(Ready())
     acquiring = False
     while True:

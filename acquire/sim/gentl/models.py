@@ -36,6 +36,7 @@ class CameraModel:
 
     @property
     def sample_bytes(self) -> int:
+        """Bytes of an unpacked sample."""
         return 1 if self.bits <= 8 else 2
 
 

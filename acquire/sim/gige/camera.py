@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from acquire.processes.worker import Mailbox
-    from acquire.sim.gentl.feeder import Sensor
+    from acquire.sim.gentl.feeder import LineSource
 
 _IDLE_S = 0.01
 _BLOCK_WAIT_S = 0.002
@@ -76,7 +76,9 @@ def serve(
 class GigeCamera:
     """See the module. Raises DeviceError if the address is taken."""
 
-    def __init__(self, model: CameraModel, sensor: Sensor, address: str, transmission: Transmission) -> None:
+    def __init__(
+        self, model: CameraModel, sensor: LineSource, address: str, transmission: Transmission
+    ) -> None:
         space = gige(model).space(_BASE)
         url = f"Local:camera.xml;{_BASE + XML_AT:X};{len(gige(model).xml(_BASE)):X}"
         texts = {
@@ -125,7 +127,7 @@ class GigeCamera:
         request = protocol.parse(packet)
         if request is None:
             return
-        if request.command == protocol.Command.RESEND:
+        if request.command == protocol.GvcpCommand.RESEND:
             # A request for a frame that is no longer kept gets no answer: the host gives the frame up.
             asked = protocol.parse_resend(request)
             for kept, packets in self._sent if self.transmission.resends else ():
@@ -149,7 +151,7 @@ class GigeCamera:
                 self._apply_registers()
             else:
                 self._registers.memory[_IMAGE_REGISTERS] = before
-                result = protocol.answer(request, b"", protocol.Status.INVALID_PARAMETER)
+                result = protocol.answer(request, b"", protocol.GvcpStatus.INVALID_PARAMETER)
             self._answered = (sender, request, result)
         reply = self._answered[2]
         if reply is not None:
@@ -185,7 +187,7 @@ class GigeCamera:
         data = samples.astype("<u2" if stored == 16 else "u1").tobytes()
         transmission = self.transmission
         number = transmission.frame_id(self._frames)
-        frame = protocol.Frame(
+        frame = protocol.GvspFrame(
             number=number,
             time_ns=time_ns,
             pixel_format=code,

@@ -17,8 +17,8 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-PORT = 3956
-KEY = 0x42
+PORT = 3956  # GVCP's, the protocol of commands
+KEY = 0x42  # first byte of every command
 IP_AND_UDP_BYTES = 20 + 8
 """Bytes of IP and UDP headers, which count towards the packet size that the host sets, as GVSP's own do."""
 
@@ -26,7 +26,7 @@ LEAST_PAYLOAD_BYTES = 64
 
 DEVICE_MODE, MAC, ADDRESS = 0x0004, 0x0008, 0x0024
 VENDOR, MODEL, FIRMWARE, SERIAL, XML_URL = 0x0048, 0x0068, 0x0088, 0x00D8, 0x0200
-DISCOVERY_BYTES = 0xF8
+DISCOVERY_BYTES = 0xF8  # the answer to DISCOVERY has the registers below this one
 STREAM_CHANNELS, CAPABILITY, HEARTBEAT_MS, TICK_HIGH, TICK_LOW = 0x0904, 0x0934, 0x0938, 0x093C, 0x0940
 PRIVILEGE, STREAM_PORT, PACKET_SIZE, STREAM_ADDRESS = 0x0A00, 0x0D00, 0x0D04, 0x0D18
 BOOTSTRAP_BYTES = 0x1_0000
@@ -36,16 +36,16 @@ _HEADER = struct.Struct(">BBHHH")
 _ANSWER = struct.Struct(">HHHH")
 _GVSP = struct.Struct(">HHI")
 _GVSP_EXTENDED = struct.Struct(">HHIQI")
-_EXTENDED = 0x8000_0000
+_EXTENDED = 0x8000_0000  # flag of a header whose frame id has 64 bits
 _EXTENDED_REQUEST = 0x10  # flag of a resend request whose frame id has 64 bits
-_RESENDS = 1 << 2
+_RESENDS = 1 << 2  # bit of CAPABILITY: lost packets can be requested again
 # reserved, payload type, time stamp, pixel format, width, height, offsets, padding of lines and of the frame
 _LEADER = struct.Struct(">HHQIIIIIHH")
 _TRAILER = struct.Struct(">HHI")
-_IMAGE = 1
+_IMAGE = 1  # payload type
 
 
-class Status(IntEnum):
+class GvcpStatus(IntEnum):
     """Why a command was not carried out, in its answer."""
 
     DONE = 0
@@ -53,7 +53,7 @@ class Status(IntEnum):
     INVALID_ADDRESS = 0x8003
 
 
-class Command(IntEnum):
+class GvcpCommand(IntEnum):
     DISCOVERY = 0x0002
     RESEND = 0x0040
     READ_REGISTER = 0x0080
@@ -95,7 +95,8 @@ def parse_resend(request: Request) -> tuple[int, int, int] | None:
     return number, first & 0xFF_FFFF, last & 0xFF_FFFF
 
 
-def answer(request: Request, body: bytes, status: Status = Status.DONE) -> bytes:
+def answer(request: Request, body: bytes, status: GvcpStatus = GvcpStatus.DONE) -> bytes:
+    """Return the acknowledge of a request."""
     # an acknowledge has the number after its command's
     return _ANSWER.pack(status, request.command + 1, len(body), request.number) + body
 
@@ -118,30 +119,32 @@ class Registers:
             self.set(at, value)
 
     def get(self, at: int) -> int:
+        """Return the 32-bit register at an address."""
         value: int = struct.unpack_from(">I", self.memory, at)[0]
         return value
 
     def set(self, at: int, value: int) -> None:
+        """Set the 32-bit register at an address."""
         struct.pack_into(">I", self.memory, at, value)
 
     def handle(self, request: Request) -> bytes | None:
         """Carry out a command and return its answer; None if it is not supported."""
         try:
             match request.command:
-                case Command.DISCOVERY:
+                case GvcpCommand.DISCOVERY:
                     body = bytes(self.memory[:DISCOVERY_BYTES])
-                case Command.READ_REGISTER:
+                case GvcpCommand.READ_REGISTER:
                     (at,) = struct.unpack(">I", request.body[:4])
                     body = bytes(self.memory[self._place(at, 4)])
-                case Command.WRITE_REGISTER:
+                case GvcpCommand.WRITE_REGISTER:
                     at, value = struct.unpack(">II", request.body[:8])
                     self.memory[self._place(at, 4)] = struct.pack(">I", value)
                     # By the standard, the number of registers that were written.
                     body = struct.pack(">I", 1)
-                case Command.READ_MEMORY:
+                case GvcpCommand.READ_MEMORY:
                     at, count = struct.unpack(">IxxH", request.body[:8])
                     body = request.body[:4] + bytes(self.memory[self._place(at, count)])
-                case Command.WRITE_MEMORY:
+                case GvcpCommand.WRITE_MEMORY:
                     (at,) = struct.unpack(">I", request.body[:4])
                     data = request.body[4:]
                     self.memory[self._place(at, len(data))] = data
@@ -149,9 +152,9 @@ class Registers:
                 case _:
                     return None
         except IndexError:
-            return answer(request, b"", Status.INVALID_ADDRESS)
+            return answer(request, b"", GvcpStatus.INVALID_ADDRESS)
         except struct.error:  # a body that is too short for its command
-            return answer(request, b"", Status.INVALID_PARAMETER)
+            return answer(request, b"", GvcpStatus.INVALID_PARAMETER)
         return answer(request, body)
 
     def _place(self, at: int, count: int) -> slice:
@@ -162,7 +165,7 @@ class Registers:
 
 
 @dataclass(frozen=True, slots=True)
-class Frame:
+class GvspFrame:
     """One block of lines to send. ``number`` is never 0 and has 16 bits, or 64 in ``extended`` headers."""
 
     number: int
@@ -175,7 +178,7 @@ class Frame:
     offset: int = 0
 
 
-def packets(frame: Frame, packet_size: int) -> Iterator[bytes]:
+def packets(frame: GvspFrame, packet_size: int) -> Iterator[bytes]:
     """Yield leader, payload and trailer."""
     size = (_GVSP_EXTENDED if frame.extended else _GVSP).size
     # A host may write any size, also one of packets that hold nothing.
@@ -190,7 +193,7 @@ def packets(frame: Frame, packet_size: int) -> Iterator[bytes]:
     yield _header(frame, 2, count + 1) + _TRAILER.pack(0, _IMAGE, frame.height)
 
 
-def _header(frame: Frame, content: int, packet: int) -> bytes:
+def _header(frame: GvspFrame, content: int, packet: int) -> bytes:
     if frame.extended:
         return _GVSP_EXTENDED.pack(0, 0, _EXTENDED | content << 24, frame.number, packet)
     return _GVSP.pack(0, frame.number, content << 24 | packet)

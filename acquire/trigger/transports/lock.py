@@ -17,9 +17,11 @@ from acquire.processes.lockfile import LockFile
 # and a user's command would lock different files.
 SHARED = Path("/run/lock")
 _COMMAND_SHOWN = 80
+"""Number of characters of the holder's command line in a message."""
 _LOOKED_AT_S = 0.1
 """Longest time for which a program that only lists the ports holds a lock."""
 _FOR_ALL = 0o666
+"""Mode of a lock file, which stays: any user may lock the port next."""
 
 
 class PortLock:

@@ -17,7 +17,7 @@ import acquire.sim.rtl
 from acquire import __version__
 from acquire.cli.demo.capture import record
 from acquire.cli.demo.plan import DemoPlan, trigger_settings
-from acquire.cli.journal import Journal
+from acquire.cli.journal import StepJournal
 from acquire.codes import PrbsCode
 from acquire.config import load_rig
 from acquire.config.device import LineOutputConfig, TriggerConfig
@@ -201,7 +201,7 @@ def test_the_demo_records_from_the_gateware(tmp_path: Path) -> None:
     """Every pixel follows Eq. (1) with the requested code; the light came from the LED's pin."""
     out = tmp_path / "out"
     out.mkdir()
-    captured = record(DemoPlan(out, lines=700, trigger="rtl"), Journal())
+    captured = record(DemoPlan(out, lines=700, trigger="rtl"), StepJournal())
     recording = open_recording(captured.path)
     assert captured.status.last is not None
     assert captured.status.last.condition == "GOOD"

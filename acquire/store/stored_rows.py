@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from acquire.store.chunks import ChunkReader
 
 
-class Stretch:
+class StoredRows:
     """Rows ``start .. stop - 1`` of an array; row 0 is the trigger's line ``first_line``."""
 
     def __init__(self, reader: ChunkReader, start: int, stop: int, first_line: int) -> None:
