@@ -46,7 +46,7 @@ class Candidate:
     ``brightness``: times a free brightness of the whole scene; ``change``: the difference from the best
     still; ``fine``: solved at N_m = 1, then merged; ``robust``: samples with large residuals have less
     weight. ``drift`` is the velocity of a volume's contents and ``rotation`` their turn, see `VolumeTv`;
-    () is none.
+    () is none. ``speed_changes`` are those of a cycle, or of these.
     """
 
     prior: Literal["still", "smooth", "volume", "cycle"]
@@ -70,9 +70,14 @@ class Candidate:
         if self.prior == "smooth":
             return Smooth(self.pace)
         cyclic = self.prior == "cycle"
-        if self.ground:
-            return GroundedTv(self.pace, self.ground, cyclic=cyclic, drift=self.drift, rotation=self.rotation)
-        return VolumeTv(self.pace, cyclic=cyclic, drift=self.drift, rotation=self.rotation)
+        # A cycle's basis has its speed.
+        rise = 0.0 if cyclic or not self.speed_changes else self.speed_changes[0]
+        volume = partial(GroundedTv, ground=self.ground) if self.ground else VolumeTv
+        return volume(self.pace, cyclic=cyclic, drift=self.drift, rotation=self.rotation, rise=rise)
+
+    def with_path_of(self, other: Candidate) -> Candidate:
+        """The candidate, following what another volume follows."""
+        return replace(self, drift=other.drift, rotation=other.rotation, speed_changes=other.speed_changes)
 
     def basis(self, frames: int, arrays: Arrays) -> TemporalBasis | CyclicBasis:
         """The temporal basis of its coefficients."""

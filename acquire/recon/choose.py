@@ -36,13 +36,13 @@ from acquire.recon.blinking import (
 )
 from acquire.recon.candidates import CALM, COSINES, GROUND, GROUNDED, SMOOTH, STILL, VOLUME
 from acquire.recon.cycle import TRIED_CHANGES, find_period
-from acquire.recon.drift import drift_of
+from acquire.recon.drift import drifting
 from acquire.recon.estimates import Preferred, Refined
 from acquire.recon.given import Given
 from acquire.recon.holdout import HeldOut
 from acquire.recon.patterns import find_patterns, has_clear_patterns
 from acquire.recon.reuse import reuse_choice
-from acquire.recon.rotation import rotation_of
+from acquire.recon.rotation import turning
 from acquire.recon.solver import Preset, Solver
 from acquire.recon.still import best_still, change_bench, weighted_like
 from acquire.recon.workbench import (
@@ -226,10 +226,9 @@ def _search(bench: Workbench, tried: _Tried, trials: int, rival: float) -> Trial
         still = best_still(plain, trials, merge=merge) if explains else bench.climb(plain, trials)
         if not bench.clock.spent(SEARCH_SHARE):
             like = weighted_like(still, bench.fitting(VOLUME))
-            chosen = volume.candidate
-            # A cycle's turn is that of one cycle, and the change is a volume.
-            rotation = () if chosen.period_frames else chosen.rotation
-            candidate = replace(like, change=True, drift=chosen.drift, rotation=rotation)
+            candidate = replace(like, change=True)
+            if not volume.candidate.period_frames:  # else it follows its own cycle
+                candidate = candidate.with_path_of(volume.candidate)
             change = change_bench(bench, still).attempt(candidate, FIRST_ITERATIONS)
             volume = min((volume, change), key=_error)
     if volume.error < FAR * rival:
@@ -254,26 +253,26 @@ def _search(bench: Workbench, tried: _Tried, trials: int, rival: float) -> Trial
 
 def _or_drifting(volume: Trial, rival: float) -> Trial:
     """The volume, or the same that follows what moves in it at one velocity, if that predicts better."""
-    bench, drift = volume.bench, drift_of(volume)
-    if not drift or bench.clock.spent(SEARCH_SHARE):
+    bench, candidate = volume.bench, drifting(volume)
+    if candidate is None or bench.clock.spent(SEARCH_SHARE):
         return volume
-    found = bench.probe(replace(volume.candidate, drift=drift), min(volume.error, rival))
-    return min(volume, _wide_enough(found, max(map(abs, drift))), key=_error)
+    found = bench.probe(candidate, min(volume.error, rival))
+    return min(volume, _wide_enough(found, max(map(abs, candidate.drift))), key=_error)
 
 
 def _or_turning(volume: Trial, rival: float) -> Trial:
     """The volume or cycle, or the same that follows what turns in it, if that predicts better."""
-    bench, rotation = volume.bench, rotation_of(volume)
-    if not rotation or bench.clock.spent(SEARCH_SHARE):
+    bench, candidate = volume.bench, turning(volume)
+    if candidate is None or bench.clock.spent(SEARCH_SHARE):
         return volume
     # With and without a ground from zero: a step from one to the other hardly arrives there.
     found = volume
     for ground in (0.0, GROUND):
-        turning = replace(volume.candidate, drift=(), rotation=rotation, ground=ground)
-        found = min(found, bench.probe(turning, min(found.error, rival)), key=_error)
+        probed = bench.probe(replace(candidate, ground=ground), min(found.error, rival))
+        found = min(found, probed, key=_error)
     if found is not volume and not found.candidate.period_frames:
         # The rim of a picture whose sides are 1 moves by π turns.
-        found = _wide_enough(found, np.pi * abs(rotation[0]))
+        found = _wide_enough(found, np.pi * abs(candidate.rotation[0]))
     # A cycle at rest had many rounds to fit its speed, and needs no head start.
     most = 1.0 if volume.candidate.period_frames else TURNING
     return found if found.error < most * volume.error else volume

@@ -39,8 +39,9 @@ class GroundedTv(VolumeTv):
         cyclic: bool = False,
         drift: tuple[float, ...] = (),
         rotation: tuple[float, ...] = (),
+        rise: float = 0.0,
     ) -> None:
-        super().__init__(pace, cyclic=cyclic, drift=drift, rotation=rotation)
+        super().__init__(pace, cyclic=cyclic, drift=drift, rotation=rotation, rise=rise)
         self.ground = ground
         self._still_tv = FrameTv(ITERATIONS)
         self._still: Array = None

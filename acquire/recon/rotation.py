@@ -1,4 +1,4 @@
-"""What turns about a fixed centre at a constant speed: found in a first video, and followed by a volume.
+"""What turns about a fixed centre: found in a first video, and followed by a volume.
 
     x(t, r) = y(t, R(−2π·ν·t)·(r − c) + c)        y hardly changes; ν in turns over the range
 
@@ -10,21 +10,21 @@ Of motion that repeats, the range is one cycle.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from scipy.optimize import minimize
 from scipy.sparse import csr_array
 
 from acquire.arrays import host, namespace
 from acquire.recon.basis import CyclicBasis, TemporalBasis
-from acquire.recon.drift import LEAST_LEFT, ROUNDING, WAVES
+from acquire.recon.drift import LEAST_LEFT, ROUNDING, WAVES, moments, refined
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from acquire.arrays import Array
-    from acquire.recon.basis import Basis
+    from acquire.recon.candidates import Candidate
     from acquire.recon.workbench import Trial
 
 COHERENT = 0.35
@@ -40,26 +40,31 @@ ANGLES = 64
 """Number of directions about a centre, enough for twice as many waves around as are compared."""
 INSTANTS, CYCLES = 36, 3
 """Numbers of instants of a volume, and of cycles of what repeats, that are compared."""
-REFINEMENTS = 80
-"""Largest number of steps from the best of these centres to a better one."""
 
 
-def rotation_of(trial: Trial) -> tuple[float, ...]:
-    """Return the turn of what moves in a trial's video or cycle, as `Candidate.rotation`; () without one."""
-    basis, arrays, cycles = trial.basis, trial.bench.problem.arrays, 1
-    instants: Basis = TemporalBasis(INSTANTS, min(basis.count, INSTANTS), arrays)
+def turning(trial: Trial) -> Candidate | None:
+    """Return a trial's candidate that follows what turns in its video or cycle; None if nothing does."""
+    basis, arrays = trial.basis, trial.bench.problem.arrays
     if isinstance(basis, CyclicBasis):
         # Within one cycle, a blade that turns to the next one's place also seems to move along a line.
-        instants, cycles = CyclicBasis(basis.count, basis.count // 2, basis.count, arrays), CYCLES
-    video = host(instants.synthesize(trial.coefficients[: instants.count, ...]))
-    found = find_rotation(np.tile(video, (cycles, 1, 1)))
-    return () if found is None else (found[0] / cycles, *found[1:])
+        cycle = CyclicBasis(basis.count, basis.count // 2, basis.count, arrays)
+        video = np.tile(host(cycle.synthesize(trial.coefficients)), (CYCLES, 1, 1))
+        found = find_rotation(video, steady=True)
+        if found is None:
+            return None
+        return replace(trial.candidate, rotation=(found[0] / CYCLES, *found[1:]), drift=())
+    instants = TemporalBasis(INSTANTS, min(basis.count, INSTANTS), arrays)
+    found = find_rotation(host(instants.synthesize(trial.coefficients[: instants.count, ...])))
+    if found is None:
+        return None
+    return replace(trial.candidate, rotation=found[:3], speed_changes=found[3:], drift=())
 
 
-def find_rotation(instants: NDArray[Any]) -> tuple[float, float, float] | None:
+def find_rotation(instants: NDArray[Any], *, steady: bool = False) -> tuple[float, ...] | None:
     """Return the turn of what moves in a video (K, n, n), as `Rotation` takes it; None if nothing turns.
 
-    What never changes does not count.
+    If the speed changes, and need not be ``steady``, its rise from the mean to the end, relative to the mean,
+    follows. What never changes does not count.
     """
     changes = instants - instants.mean(axis=0)
     if np.square(changes).sum() <= ROUNDING * np.square(instants).sum():
@@ -75,22 +80,15 @@ def find_rotation(instants: NDArray[Any]) -> tuple[float, float, float] | None:
         for share in [_coherent(changes, *waves_of, row, column)]
     )[1:]
 
-    def missed(x: NDArray[np.float64]) -> float:
-        return -float(_coherent(changes, *_waves_of(x[:1], count), x[1], x[2])[0])
+    def share(x: NDArray[np.float64]) -> float:
+        return float(_coherent(changes, *_waves_of(x[:1], count, x[3]), x[1], x[2])[0])
 
-    steps = np.diag([1 / (4 * WAVES), BETWEEN / 2, BETWEEN / 2])
-    simplex = np.vstack([np.zeros(3), steps]) + start
-    found = minimize(
-        missed,
-        np.array(start),
-        method="Nelder-Mead",
-        options={"initial_simplex": simplex, "maxfev": REFINEMENTS, "xatol": 1e-3, "fatol": 1e-4},
-    )
-    turned, row, column = map(float, found.x)
+    steps = np.array([1 / (4 * WAVES), BETWEEN / 2, BETWEEN / 2])
+    found = refined(share, np.array(start), steps, steady=steady)
     # What passes far from the middle seems to turn about a centre that is farther than any that is tried.
-    if -found.fun < COHERENT or max(abs(row), abs(column)) > FARTHEST:
+    if share(np.array([*found, 0.0][:4])) < COHERENT or max(map(abs, found[1:3])) > FARTHEST:
         return None
-    return turned, row, column
+    return found
 
 
 def _reduced(video: NDArray[Any]) -> NDArray[Any]:
@@ -106,12 +104,12 @@ def _reduced(video: NDArray[Any]) -> NDArray[Any]:
     return video
 
 
-def _waves_of(turns: NDArray[Any], count: int) -> tuple[NDArray[Any], NDArray[Any]]:
+def _waves_of(turns: NDArray[Any], count: int, rise: float = 0.0) -> tuple[NDArray[Any], NDArray[Any]]:
     """What makes the waves (instant, turn, wave) of each of ``turns`` stand still, and their energies.
 
     The mean over time, which is subtracted, holds a part of a wave that turns slowly.
     """
-    t, m = (np.arange(count) + 0.5) / count - 0.5, np.arange(1, WAVES + 1)
+    t, m = moments(count, rise), np.arange(1, WAVES + 1)
     back = np.exp(2j * np.pi * t[:, None, None] * turns[:, None] * m)
     return back, count * np.maximum(1 - np.square(np.abs(back.mean(axis=0))), LEAST_LEFT)
 
@@ -157,10 +155,12 @@ class Rotation:
     interpolated by their waves, so that the map is orthonormal, as in `drift.Path`.
     """
 
-    def __init__(self, rotation: tuple[float, ...], count: int, side: int, like: Array) -> None:
+    def __init__(
+        self, rotation: tuple[float, ...], count: int, side: int, like: Array, rise: float = 0.0
+    ) -> None:
         xp = namespace(like)
         turns, row, column = rotation
-        angle = 2 * np.pi * turns * ((np.arange(count) + 0.5) / count - 0.5)
+        angle = 2 * np.pi * turns * moments(count, rise)
         quarters = np.rint(angle / (np.pi / 2))
         rest = angle - quarters * (np.pi / 2)
         y, x = (np.arange(side) - (side - 1) / 2 - centre * side for centre in (row, column))

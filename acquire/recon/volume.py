@@ -38,6 +38,7 @@ class VolumeTv:
     If it is ``cyclic``, the coefficients are those of a `CyclicBasis`, and the instants those of one cycle.
     ``drift`` is the velocity (rows, columns) of the volume's contents in sides of the picture over all
     instants, and ``rotation`` their turn, see `Rotation`, along which changes are counted; () is none.
+    ``rise`` is that of the speed from its mean to the end, relative to the mean.
     The transform between coefficients and instants is orthonormal, so that the prox of one is the prox of the
     other. ``prox`` is approximate: ``iterations`` of fast gradient projection (Beck and Teboulle, IEEE
     Trans. Image Process. 18, 2419 (2009)) from where the last call ended.
@@ -51,6 +52,7 @@ class VolumeTv:
         cyclic: bool = False,
         drift: tuple[float, ...] = (),
         rotation: tuple[float, ...] = (),
+        rise: float = 0.0,
     ) -> None:
         if not 0 <= pace < math.inf:
             raise UsageError(
@@ -59,7 +61,7 @@ class VolumeTv:
         if iterations < 1:
             raise UsageError(f"the TV prox cannot have {iterations} iterations", possible="1 or more")
         self.pace, self.iterations, self.cyclic = pace, iterations, cyclic
-        self.drift, self.rotation = drift, rotation
+        self.drift, self.rotation, self.rise = drift, rotation, rise
         self._dual: Array = None
         self._instants: Array = None
         self._path: Path | Rotation | None = None
@@ -78,9 +80,9 @@ class VolumeTv:
             return frames
         count = frames.shape[0]
         if self.drift and self._path is None:
-            self._path = Path(self.drift, count, frames.shape[1], frames)
+            self._path = Path(self.drift, count, frames.shape[1], frames, self.rise)
         if self.rotation and self._path is None:
-            self._path = Rotation(self.rotation, count, frames.shape[1], frames)
+            self._path = Rotation(self.rotation, count, frames.shape[1], frames, self.rise)
         if self._dual is None:
             self._dual = xp.stack([xp.zeros_like(frames)] * 3)
             # It is computed in float64, so that frames of float64 do not get cosines that are rounded to

@@ -21,8 +21,8 @@ from acquire.recon.basis import CyclicBasis, TemporalBasis, resized
 from acquire.recon.brightness import fit_brightness
 from acquire.recon.candidates import CALM, CYCLE, USUAL_ENERGY, VOLUME, Candidate, parameters
 from acquire.recon.cycle import FEWEST_HARMONICS, better_speed, most_harmonics
-from acquire.recon.drift import drift_of
-from acquire.recon.rotation import rotation_of
+from acquire.recon.drift import drifting
+from acquire.recon.rotation import turning
 from acquire.recon.volume import VolumeTv
 
 if TYPE_CHECKING:
@@ -261,12 +261,8 @@ class Workbench:
     def follow_path(self, best: Trial) -> Trial:
         """Find the velocity or the turn again in the better video, as long as the prediction improves."""
         for _ in range(SPEED_ROUNDS):
-            candidate = best.candidate
-            if candidate.rotation:
-                moved = replace(candidate, rotation=rotation_of(best))
-            else:
-                moved = replace(candidate, drift=drift_of(best))
-            if not (moved.rotation or moved.drift) or self.clock.spent(SEARCH_SHARE):
+            moved = turning(best) if best.candidate.rotation else drifting(best)
+            if moved is None or self.clock.spent(SEARCH_SHARE):
                 break
             found = self.attempt(moved, NEXT_ITERATIONS, best)
             gained = found.error < WORTH_A_ROUND * best.error
