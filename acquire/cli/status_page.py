@@ -54,7 +54,7 @@ def status_lines(status: Facts) -> list[str]:
         "last": last,
         "not sealed": _recoveries(status),
         "uploads": _uploads(status),
-        "disk": _disk(status["disk"]),
+        "disk": _trouble_with_disk(status) or _disk(status["disk"]),
         "trigger": _trigger(status["trigger"]),
         "sustains": _capacity(status),
         "calibration": status["calibration"] and status["calibration"]["text"],
@@ -78,7 +78,8 @@ def status_line(status: Facts) -> str:
     full = max((arm["ring"]["fill"] / arm["ring"]["slots"] for arm in arms.values()), default=0.0)
     now = status["recording"]
     recording = f", {PurePath(now['path']).name} {now['recorded_lines']} lines" if now else ""
-    more = f", {status['busy'] or status['waiting']}" if status["busy"] or status["waiting"] else ""
+    waits = status["busy"] or status["waiting"] or _trouble_with_disk(status)
+    more = f", {waits}" if waits else ""
     return f"{status['state']}{recording}, lost {lost}, rings {full:.0%}{more}"
 
 
@@ -161,6 +162,11 @@ def _trigger(trigger: Facts | None) -> str | None:
         f"clock {quantity(trigger['clock_hz'], 'Hz')}, UTC known to {trigger['uncertainty_ns'] / 1000:.3g} us"
     )
     return f"{answers}, {trigger['pulses']} lines, {clock}"
+
+
+def _trouble_with_disk(status: Facts) -> str | None:
+    trouble = status.get("disk_trouble")
+    return trouble and f"WARNING: {trouble}"
 
 
 def _disk(disk: Facts | None) -> str | None:

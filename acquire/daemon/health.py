@@ -115,7 +115,7 @@ def _code(name: str, arm: ArmStatus) -> HealthCheck:
 
 
 def _of_service(status: Status) -> list[HealthCheck]:
-    found = [disk_check(status.disk)]
+    found = [disk_check(status.disk, status.disk_trouble)]
     if (held := held_check(status)) is not None:
         found.append(held)
     if status.trigger is not None:
@@ -161,9 +161,11 @@ def held_check(status: Status) -> HealthCheck | None:
     )
 
 
-def disk_check(disk: DiskStatus | None) -> HealthCheck:
-    """Judge how long the disk lasts."""
+def disk_check(disk: DiskStatus | None, trouble: str | None = None) -> HealthCheck:
+    """Judge how long the disk lasts; with ``trouble``, nothing can be recorded on it."""
     limit = f"good from {DISK_GOOD_S / 3600:.0f} h on, bad below {DISK_BAD_S / 60:.0f} min"
+    if trouble is not None:
+        return HealthCheck(name="disk", level="bad", text=trouble, limit=limit)
     if disk is None:
         return HealthCheck(name="disk", level="unknown", text="the disk has not answered yet", limit=limit)
     left_s = disk.seconds_to_full

@@ -142,7 +142,7 @@ class Changes:
         known = {one.text: one.times for one in before.troubles} if before else {}
         new = [one for one in status.troubles if one.times > known.get(one.text, 0)]
         troubles = [_fact("trouble", one.text, "error") for one in new]
-        found += self._disk_level(status) + _held(before, status) + troubles
+        found += _directory(before, status) + self._disk_level(status) + _held(before, status) + troubles
         # Only the beginning and the end of a wait are news: its text changes every second.
         waited = bool(before and before.waiting)
         if status.waiting and not waited:
@@ -165,6 +165,17 @@ class Changes:
 
 def _fact(kind: NewsKind, text: str, level: Level = "info", **more: Any) -> dict[str, Any]:
     return {"kind": kind, "text": text, "level": level, **more}
+
+
+def _directory(before: Status | None, after: Status) -> list[dict[str, Any]]:
+    """Report when the recordings' directory cannot be used any more, and when it can be used again."""
+    was, now = before.disk_trouble if before else None, after.disk_trouble
+    # Without what changes every second, such as for how long a disk has not answered.
+    if bool(was) == bool(now):
+        return []
+    text = now or "recordings can begin in the configured directory again"
+    log.log(logging.ERROR if now else logging.INFO, "%s", text)
+    return [_fact("disk", text, "error" if now else "info")]
 
 
 def _held(before: Status | None, after: Status) -> list[dict[str, Any]]:

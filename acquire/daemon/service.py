@@ -24,7 +24,7 @@ from acquire.daemon.plan import default_path, recording_of
 from acquire.daemon.report import Rates, arm_statuses, seconds_since, trigger_status
 from acquire.daemon.salvage import Salvage
 from acquire.daemon.states import Event, State, after, commands, possible
-from acquire.daemon.take import Take, log_event
+from acquire.daemon.take import Take, and_then, log_event, with_cause
 from acquire.daemon.troubles import Troubles
 from acquire.daemon.uploads import Uploads
 from acquire.errors import AcquireError, StateError, UsageError
@@ -95,8 +95,9 @@ class Service:
         """Return the latest published status; never waits."""
         # These change even while the devices' thread waits for a device and publishes nothing.
         ages = {"uptime_s": seconds_since(self._born), "state_s": seconds_since(self._since_s)}
-        others = {"troubles": self.troubles.statuses, "disk": self._disk.status}
-        return self._status.model_copy(update=ages | others)
+        trouble = self._disk.trouble
+        disk = {"disk": self._disk.status, "disk_trouble": None if trouble is None else str(trouble)}
+        return self._status.model_copy(update=ages | disk | {"troubles": self.troubles.statuses})
 
     def ring_places(self) -> tuple[str | None, dict[str, tuple[str, RingShape]]]:
         """Return the run's ID, and per arm the path and shape of its ring's memory."""
@@ -217,7 +218,7 @@ class Service:
         beside: tuple[tuple[str, Callable[[], object]], ...] = (
             ("recoveries", lambda: self._recovered(self._salvage.poll(capturing=self._run is not None))),
             ("uploads", self._uploads.poll),
-            ("disk", lambda: self._disk.check(recording=self._state is State.RECORDING)),
+            ("disk", self._check_disk),
         )
         for what, work in beside:
             try:
@@ -239,6 +240,11 @@ class Service:
             self.troubles.note("watching the capture", error)
             self._fail(self._with_cause(f"defect in the daemon: {error!r}"))
         self._publish()
+
+    def _check_disk(self) -> None:
+        self._disk.check(recording=self._state is State.RECORDING)
+        if self._disk.came_back():
+            self._salvage.search()  # it may have brought recordings that were left open
 
     def shutdown(self) -> None:
         """Seal and release, whatever the state. Bounded in time; raises only errors of closing a run."""
@@ -316,6 +322,7 @@ class Service:
     def _begin(self, begin: Begin, *, by_event: bool = False) -> None:
         assert self._run is not None
         # First, so that a refused start leaves no trace in the journals.
+        self._disk.refuse(begin.path)
         self._run.capture.start(begin)
         path, lines = begin.path, begin.budget_lines
         self._salvage.began(path)
@@ -374,12 +381,7 @@ class Service:
             self._try_event(take.late)
 
     def _with_cause(self, trouble: str) -> str:
-        """Return the text of a failure, after its probable cause: the reason why the recording ended."""
-        seen, cause = self._seen, self._seen.fault
-        ending = self._state in (State.RECORDING, State.DRAINING)
-        if cause is None and ending and seen.condition is not RunCondition.GOOD:
-            cause = seen.end_reason
-        return f"{cause}; then, while ending: {trouble}" if cause else trouble
+        return with_cause(trouble, self._seen, ending=self._state in (State.RECORDING, State.DRAINING))
 
     def _fail(self, text: str) -> None:
         """Publish the fault at once, release the devices, and wait until it is read."""
@@ -388,7 +390,7 @@ class Service:
         try:
             self._release()
         except AcquireError as error:
-            self._fault = f"{text}; then, while ending: {error}"
+            self._fault = and_then(text, str(error))
         self._go(Event.FAULT, self._fault)
 
     def _release(self) -> None:

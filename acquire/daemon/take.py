@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 
 from acquire.daemon.messages import LastRecording, RecordingStatus
 from acquire.logs import EACH
+from acquire.store import RunCondition
 from acquire.text import shortened
 
 if TYPE_CHECKING:
@@ -35,6 +36,19 @@ def log_event(note: Note, take: Take | None) -> None:
     log.info("event: mark at line %d%s", note.line, text, extra=EACH)
     if take is not None:
         take.marks.append(note)
+
+
+def with_cause(trouble: str, seen: CaptureStatus, *, ending: bool) -> str:
+    """Return the text of a failure, after its probable cause: the reason why the recording ended."""
+    cause = seen.fault
+    if cause is None and ending and seen.condition is not RunCondition.GOOD:
+        cause = seen.end_reason
+    return and_then(cause, trouble) if cause else trouble
+
+
+def and_then(cause: str, trouble: str) -> str:
+    """Return the text of a failure with what went wrong after it, unless that is the same."""
+    return cause if trouble in cause else f"{cause}; then, while ending: {trouble}"
 
 
 @dataclass(slots=True)

@@ -214,6 +214,16 @@ def test_the_service_tells_states_marks_and_faults(tmp_path: Path) -> None:
     service.disarm()
 
 
+def test_a_directory_that_is_away_is_reported_when_it_goes_and_when_it_is_back() -> None:
+    changes = Changes()
+    changes.of(status())
+    (told,) = changes.of(status(disk=None, disk_trouble="no recording can begin in /d: silent for 11 s"))
+    assert (told["kind"], told["level"]) == ("disk", "error")
+    assert not changes.of(status(disk=None, disk_trouble="no recording can begin in /d: silent for 12 s"))
+    (told,) = changes.of(status())
+    assert (told["kind"], told["level"]) == ("disk", "info")
+
+
 @pytest.mark.parametrize(
     ("seen", "level", "words"),
     [
@@ -225,6 +235,7 @@ def test_the_service_tells_states_marks_and_faults(tmp_path: Path) -> None:
         (status(arm_status(saturated_part=0.2)), "degraded", "20.0% of the lines"),
         (status(arm_status(rate_hz=500.0)), "degraded", "500 lines/s of 1000"),
         (status(disk=disk(300.0)), "degraded", "full in 5 min"),
+        (status(disk=None, disk_trouble="/d is away; mount it"), "degraded", "; /d is away; mount it."),
         (status(recording=recording(7)), "degraded", "7 B more than recording.retention.max_gb allows"),
         (status(state=State.FAULTED, fault="no light"), "fault", "no light"),
     ],

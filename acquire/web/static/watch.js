@@ -116,7 +116,7 @@ export class Watch {
     facts.push(["Recording", status.recording ? `${name(status.recording.path)}, ${count(status.recording.recorded_lines)} lines, ${count(status.recording.committed_lines)} readable` : "–"]);
     facts.push(["Pre-trigger", history === null ? "–" : `${history.toFixed(1)} s available now`]);
     facts.push(["Trigger", status.trigger ? `${status.trigger.answers ? "answers" : `SILENT for ${duration(status.trigger.silent_s)}`}, ${count(status.trigger.pulses)} lines` : "–"]);
-    facts.push(["Disk", status.disk ? `${quantity(status.disk.free_bytes, "B")} free, full in ${duration(status.disk.seconds_to_full)}` : "–"]);
+    facts.push(["Disk", status.disk_trouble ? `✗ ${status.disk_trouble}` : status.disk ? `${quantity(status.disk.free_bytes, "B")} free, full in ${duration(status.disk.seconds_to_full)}` : "–"]);
     facts.push(["Last", status.last ? `${name(status.last.path)}, ${count(status.last.lines)} lines, ${status.last.condition ?? "not sealed"}` : "–"]);
     if (status.waiting) facts.push(["Waiting", status.waiting]);
     fill($("now"), JSON.stringify(facts), () => facts.flatMap(([term, text]) => [make("dt", {}, term), make("dd", {}, text)]));
