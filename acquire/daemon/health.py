@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Literal
 
 from acquire.daemon.facts import Health, HealthCheck
 from acquire.daemon.states import State
+from acquire.text import counted
 
 if TYPE_CHECKING:
     from acquire.daemon.messages import ArmStatus, DiskStatus, Status
@@ -37,7 +38,7 @@ def health_of(status: Status, line_rate_hz: float, age_s: float = 0.0) -> Health
     if status.state is State.FAULTED:
         level, sentence = "fault", f"Fault: {status.fault}"
     elif lost:
-        level, sentence = "lost", f"{lost} lines were lost since the instrument was armed."
+        level, sentence = "lost", f"{counted(lost, 'line', 'was')} lost since the instrument was armed."
     elif _RANK[worst.level]:
         level, sentence = "degraded", f"Nothing is lost; {worst.text}."
     elif status.state is State.IDLE:
@@ -135,7 +136,7 @@ def _of_service(status: Status) -> list[HealthCheck]:
         found.append(HealthCheck(name="capacity", level="warning", text=status.capacity.warning))
     failing = next((one for one in status.uploads if one.error), None)
     if failing is not None:
-        text = f"{status.uploads_left} recordings are not copied: {failing.error}"
+        text = f"{counted(status.uploads_left, 'recording', 'is')} not copied: {failing.error}"
         found.append(HealthCheck(name="uploads", level="warning", text=text, value=status.uploads_left))
     if status.troubles:
         found.append(HealthCheck(name="troubles", level="warning", text=status.troubles[-1].text))

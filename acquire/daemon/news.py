@@ -21,6 +21,7 @@ from typing import TYPE_CHECKING, Any, cast, get_args
 from acquire.daemon.facts import Level, News, NewsKind
 from acquire.daemon.health import disk_check, held_check
 from acquire.daemon.states import State
+from acquire.text import counted
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -80,7 +81,7 @@ class NewsLog:
             # A client that continues after news that are gone must learn that it missed some.
             text = "the daemon was restarted: earlier news are in its log and in the recordings"
             if ours:
-                text = f"{first - 1 - seen} news are not kept any more"
+                text = f"{counted(first - 1 - seen, 'earlier event', 'is')} not kept any more"
             made, now = f"{self.life}-{first - 1}", datetime.now(UTC)
             return [News(id=made, time=now, kind="missed", text=text, state=self._state), *news]
 
@@ -130,7 +131,7 @@ class Changes:
                 if lines <= reported or self._now_s() - at_s < LOSSES_EVERY_S:
                     continue
                 self._lost[arm, cause] = lines, self._now_s()
-                text = f"arm {arm} lost {lines - reported} lines: {cause.replace('_', ' ')}"
+                text = f"arm {arm} lost {counted(lines - reported, 'line')}: {cause.replace('_', ' ')}"
                 found.append(_fact("loss", text, "error", arm=arm, lines=lines - reported))
         if before is not None and same_run:
             found += _verdicts(before, status)

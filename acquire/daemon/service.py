@@ -24,7 +24,7 @@ from acquire.daemon.plan import default_path, recording_of
 from acquire.daemon.report import Rates, arm_statuses, seconds_since, trigger_status
 from acquire.daemon.salvage import Salvage
 from acquire.daemon.states import Event, State, after, commands, possible
-from acquire.daemon.take import Take, and_then, log_event, with_cause
+from acquire.daemon.take import Take, and_then, in_words, log_event, with_cause
 from acquire.daemon.troubles import Troubles
 from acquire.daemon.uploads import Uploads
 from acquire.errors import AcquireError, StateError, UsageError
@@ -329,7 +329,7 @@ class Service:
         self._uploads.forget(path)
         self._uploads.add(path)
         self._take = Take(path, lines, by_event)
-        self._go(Event.START, f"{path}, {'until stopped' if lines is None else f'{lines} lines'}")
+        self._go(Event.START, self._take.in_words)
 
     def _try_event(self, note: Note) -> None:
         """Handle an event; if its recording cannot be created, the next event is still waited for."""
@@ -373,8 +373,7 @@ class Service:
         if aborted:
             self._fail(f"the recording was aborted: {self._seen.end_reason}{take.marks_after(self._seen)}")
             return
-        last = self._last
-        why = f"{last.path}, {last.lines} lines, {last.condition}, {last.end_reason}" if last else ""
+        why = in_words(self._last) if self._last else ""
         self._go(Event.SEALED if stays else Event.RELEASED, why)
         # An event that came while the recording of its predecessor was being sealed was postponed.
         if stays and take.late is not None:

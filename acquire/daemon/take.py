@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 from acquire.daemon.messages import LastRecording, RecordingStatus
 from acquire.logs import EACH
 from acquire.store import RunCondition
-from acquire.text import shortened
+from acquire.text import counted, shortened
 
 if TYPE_CHECKING:
     from acquire.stream import CaptureStatus
@@ -46,6 +46,11 @@ def with_cause(trouble: str, seen: CaptureStatus, *, ending: bool) -> str:
     return and_then(cause, trouble) if cause else trouble
 
 
+def in_words(last: LastRecording) -> str:
+    """Return the result of a recording as one line for log and news."""
+    return f"{last.path}, {counted(last.lines, 'line')}, {last.condition}, {last.end_reason}"
+
+
 def and_then(cause: str, trouble: str) -> str:
     """Return the text of a failure with what went wrong after it, unless that is the same."""
     return cause if trouble in cause else f"{cause}; then, while ending: {trouble}"
@@ -71,6 +76,11 @@ class Take:
     marks: deque[Note] = field(default_factory=lambda: deque(maxlen=MOST_MARKS))
     _progress: tuple[int, int] = (-1, -1)
     _moved_s: float = field(default_factory=time.monotonic)
+
+    @property
+    def in_words(self) -> str:
+        """The request, for log and news."""
+        return f"{self.path}, {'until stopped' if self.lines is None else counted(self.lines, 'line')}"
 
     def idle_s(self, seen: CaptureStatus) -> float:
         """Return the seconds since it last made progress in the recorder or on disk."""
@@ -105,8 +115,8 @@ class Take:
         """Return the result for the daemon's status, once the recording has ended, and log what it lacks."""
         path = Path(seen.path or self.path)
         if more := seen.ledger.get("events_not_listed"):
-            text = "%s does not list its last %d events: their table is full; this log has all marks"
-            log.warning(text, path, more)
+            text = "%s does not list its last %s: their table is full; this log has all marks"
+            log.warning(text, path, counted(more, "event"))
         return LastRecording(
             path=path,
             lines=seen.committed_lines,

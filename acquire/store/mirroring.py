@@ -34,6 +34,7 @@ from acquire.store.remote import RemoteSource
 from acquire.store.removal import ROOT, shard_files
 from acquire.store.retention import keep_from, release
 from acquire.store.shortfall import first_shortfall
+from acquire.text import counted
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -108,7 +109,7 @@ def mirror(
             if time.monotonic() - moved > idle_s:
                 raise DataError(
                     f"{path} has not grown for {idle_s:g} s and is not sealed",
-                    possible=f"{done.lines} lines are in {copying.target}",
+                    possible=f"{counted(done.lines, 'line', 'is')} in {copying.target}",
                     hint=f"acquire recover {path}, then copy again",
                 )
         return done

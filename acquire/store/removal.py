@@ -12,6 +12,7 @@ from acquire.store.files import SCRATCH
 from acquire.store.layout import line_columns
 from acquire.store.links import refuse_link, refuse_links
 from acquire.store.shape import shard_key
+from acquire.text import counted
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -52,7 +53,7 @@ def remove(disk: Disk, path: Path, proof: Unborn | Dropped) -> None:
         case Unborn(committed_lines):
             if committed_lines:
                 raise DataError(
-                    f"{path} is not removed: {committed_lines} lines of it were committed",
+                    f"{path} is not removed: {counted(committed_lines, 'line of it', 'was')} committed",
                     hint="acquire recover, which seals it with these lines",
                 )
             refuse_links(path)

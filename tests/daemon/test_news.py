@@ -86,7 +86,7 @@ def test_news_that_are_not_kept_any_more_are_reported_as_missed() -> None:
     for text in "abcd":
         log.add("mark", text)
     missed, *others = log.after(seen)
-    assert (missed.kind, missed.text) == ("missed", "2 news are not kept any more")
+    assert (missed.kind, missed.text) == ("missed", "2 earlier events are not kept any more")
     assert [one.text for one in others] == ["c", "d"]
     assert [one.text for one in log.after(missed.id)] == ["c", "d"]  # its id is a place in the log as well
 
