@@ -414,7 +414,7 @@ class RecordingWriter:
         self._committed = rows  # only now: nothing is acknowledged that a reader would not find
 
     def _reserve_for(self, root_bytes: int) -> None:
-        """Keep room for the end of a root that has grown: it lists every hold, and what was dropped between."""
+        """Keep room for the end of a root that has grown: it lists holds, and what was dropped between."""
         # Root and copy are each written before they replace the old one.
         if 2 * root_bytes <= self._reserved - RESERVE_BYTES + USUAL_ROOT_BYTES:
             return
