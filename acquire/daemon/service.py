@@ -322,13 +322,14 @@ class Service:
     def _begin(self, begin: Begin, *, by_event: bool = False) -> None:
         assert self._run is not None
         # First, so that a refused start leaves no trace in the journals.
-        self._disk.refuse(begin.path)
-        self._run.capture.start(begin)
         path, lines = begin.path, begin.budget_lines
+        self._disk.refuse(path)
+        self._run.capture.start(begin)
         self._salvage.began(path)
         self._uploads.forget(path)
         self._uploads.add(path)
-        self._take = Take(path, lines, by_event)
+        before = None if self._seen.path == str(path) else self._seen.path
+        self._take = Take(path, lines, by_event, before=before)
         self._go(Event.START, self._take.in_words)
 
     def _try_event(self, note: Note) -> None:

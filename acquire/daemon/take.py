@@ -12,10 +12,10 @@ from typing import TYPE_CHECKING
 from acquire.daemon.messages import LastRecording, RecordingStatus
 from acquire.logs import EACH
 from acquire.store import RunCondition
+from acquire.stream import CaptureStatus
 from acquire.text import counted, shortened
 
 if TYPE_CHECKING:
-    from acquire.stream import CaptureStatus
     from acquire.stream.messages import Note
 
 
@@ -66,6 +66,7 @@ class Take:
     lines : its budget; None: until it is stopped
     by_event : an event started it, and later events prolong it
     late : the first event that came too late to prolong it
+    before : path of the recording before it, if that is another
     marks : the latest marks since its start
     """
 
@@ -73,6 +74,7 @@ class Take:
     lines: int | None
     by_event: bool = False
     late: Note | None = None
+    before: str | None = None
     marks: deque[Note] = field(default_factory=lambda: deque(maxlen=MOST_MARKS))
     _progress: tuple[int, int] = (-1, -1)
     _moved_s: float = field(default_factory=time.monotonic)
@@ -90,10 +92,16 @@ class Take:
             self._progress, self._moved_s = progress, time.monotonic()
         return time.monotonic() - self._moved_s
 
+    def path_now(self, seen: CaptureStatus) -> Path:
+        """Return its own path, or that of the segment in which it continues."""
+        return self.path if seen.path in (None, self.before) else Path(seen.path)
+
     def status(self, seen: CaptureStatus) -> RecordingStatus:
         """Return the status of the recording while it is being written."""
+        if seen.path == self.before:  # of the recording before it, as long as nothing of this one was seen
+            seen = CaptureStatus()
         return RecordingStatus(
-            path=Path(seen.path or self.path),
+            path=self.path_now(seen),
             first_line=seen.first_line,
             budget_lines=self.lines,
             recorded_lines=seen.recorded_lines,
@@ -113,7 +121,7 @@ class Take:
 
     def result(self, seen: CaptureStatus) -> LastRecording:
         """Return the result for the daemon's status, once the recording has ended, and log what it lacks."""
-        path = Path(seen.path or self.path)
+        path = self.path_now(seen)
         if more := seen.ledger.get("events_not_listed"):
             text = "%s does not list its last %s: their table is full; this log has all marks"
             log.warning(text, path, counted(more, "event"))
