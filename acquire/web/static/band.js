@@ -65,5 +65,5 @@ function left(status) {
   const now = status.recording;
   if (now?.budget_lines) return ["left", counted(Math.max(0, now.budget_lines - now.recorded_lines), "line")];
   if (now) return ["recorded", counted(now.recorded_lines, "line")];
-  return ["space on the disk", status.disk_trouble ? "none" : status.disk ? duration(status.disk.seconds_to_full) : "–"];
+  return ["space on the disk", status.disk_trouble ? "unusable" : status.disk ? duration(status.disk.seconds_to_full) : "–"];
 }
