@@ -92,10 +92,18 @@ def _look_at(path: Path, found: Found, *, noted: bool) -> None:
             )
             found.odd.append(RecoveryStatus(path=path, state="gone", text=text))
         else:
-            found.odd.append(RecoveryStatus(path=path, state="left", text=error.message))
+            found.odd.append(RecoveryStatus(path=path, state="left", text=_without(path, error.message)))
         return
     if attributes.get("format") in READABLE and attributes.get("state") == "recording":
         found.open.append(path)
+
+
+def _without(path: Path, message: str) -> str:
+    """Return an error about a path for a text that begins with its name."""
+    if path.is_symlink() and not path.exists():
+        return f"it is a link to {path.readlink()}, which does not exist"
+    rest = message.removeprefix(str(path))
+    return message if rest == message else f"it{rest}" if rest.startswith(" ") else rest.removeprefix(": ")
 
 
 def salvage(mailbox: Mailbox, task: Task) -> None:
