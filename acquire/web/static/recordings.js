@@ -35,9 +35,9 @@ export class Recordings {
   #list(recordings) {
     const more = recordings.length < MOST_LISTED ? [] : [make("li", { className: "hint" }, `The newest ${MOST_LISTED} are shown; acquire ls lists all.`)];
     fill($("recording-list"), JSON.stringify([recordings, this.#chosen]), () => recordings.length ? [...recordings.map((one) => {
-      const lost = Object.values(one.lost_lines ?? {}).reduce((sum, n) => sum + n, 0), state = one.error ? "DAMAGED" : one.condition ?? one.state;
+      const lost = Object.values(one.lost_lines ?? {}).reduce((sum, n) => sum + n, 0), state = one.error ? "cannot be read" : one.condition ?? one.state;
       return make("li", {}, make("button", { id: `recording-${one.name}`, "aria-pressed": String(one.name === this.#chosen), onclick: () => this.#choose(one.name) },
-        make("img", { src: one.error ? "" : `/api/recordings/${encodeURIComponent(one.name)}/picture?${one.lines}`, alt: "", loading: "lazy" }),
+        one.error ? make("span", { className: "blank", "aria-hidden": "true" }) : make("img", { src: `/api/recordings/${encodeURIComponent(one.name)}/picture?${one.lines}`, alt: "", loading: "lazy" }),
         make("span", {}, make("b", {}, one.name),
           make("small", { className: one.error || one.damage || lost || one.tainted_by.length || one.incomplete.length ? "bad" : "" }, `${state}${lost ? `, ${counted(lost, "line")} lost` : ""}${one.incomplete.length ? ", its lists are incomplete" : ""}${one.held ? ", held" : ""}`),
           make("small", {}, one.error ?? `${counted(one.lines, "line")}, ${duration(one.duration_s)}, ${quantity(one.bytes, "B")}`),
