@@ -183,7 +183,9 @@ def hold(
     ] = None,
     begin: FromOption = None,
     end: ToOption = None,
-    why: Annotated[str, typer.Option(metavar="TEXT", help="Reason, stored with the held lines.")] = "",
+    why: Annotated[
+        str, typer.Option(metavar="TEXT", help="Reason, stored with the held lines (up to 200 characters).")
+    ] = "",
     json: JsonFlag = False,
 ) -> None:
     """Keep lines of an endless recording, and the neighbours needed to reconstruct them, from being dropped.

@@ -11,11 +11,13 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
-from acquire.lines import ARMS
+from acquire.flags import ARMS
 from acquire.reading import read_object
-from acquire.store.removal import COPY, ROOT
 
 SUFFIX = ".zarr"
+ROOT = "zarr.json"
+COPY = ".attributes"
+"""Copy of the root's attributes, next to the shards of the first array; see `acquire.store.rebuild`."""
 _OURS = "acquire-"
 """Beginning of each of our formats."""
 

@@ -28,10 +28,11 @@ from acquire.store.attributes import segment_of
 from acquire.store.files import DISK, SCRATCH, locked
 from acquire.store.layout import PARSE_ERRORS, group_document, to_json
 from acquire.store.links import refuse_link, refuse_links
+from acquire.store.listing import ROOT
 from acquire.store.reader import open_recording
 from acquire.store.refusals import refusal
 from acquire.store.remote import RemoteSource
-from acquire.store.removal import ROOT, shard_files
+from acquire.store.removal import shard_files
 from acquire.store.retention import keep_from, release
 from acquire.store.shortfall import first_shortfall
 from acquire.text import counted

@@ -11,6 +11,7 @@ from acquire.lines import ARMS
 from acquire.store.files import SCRATCH
 from acquire.store.layout import line_columns
 from acquire.store.links import refuse_link, refuse_links
+from acquire.store.listing import COPY, ROOT
 from acquire.store.shape import shard_key
 from acquire.text import counted
 
@@ -20,11 +21,8 @@ if TYPE_CHECKING:
 
     from acquire.store.files import Disk
 
-ROOT = "zarr.json"
 RESERVE = ".reserve"
 """File that keeps room for a recording's end while it is written, next to the shards of the first array."""
-COPY = ".attributes"
-"""Copy of the root's attributes, next to the shards of the first array; see `acquire.store.rebuild`."""
 _MADE_FIRST = {ROOT, SCRATCH, RESERVE, COPY}
 """Files that exist before the first line; all others hold lines, or belong to somebody else."""
 
