@@ -21,7 +21,7 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING
 
-from acquire.text import visible
+from acquire.text import counted, visible
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -114,9 +114,8 @@ class Bounded(logging.Filter):
                 break  # kinds are in the order in which their windows began
             del self._counts[kind]
             if count.seen > count.most:
-                self._report(
-                    f"{count.seen - count.most} more entries like this one were not written: {kind[2]}"
-                )
+                more = counted(count.seen - count.most, "more entry", "was")
+                self._report(f"{more} not written, like this: {kind[2]}")
         kind = (record.name, record.levelno, str(record.msg)[:MOST_CHARACTERS])
         count = self._counts.setdefault(kind, _Count(now_s, getattr(record, "most", REPEATS)))
         count.seen += 1
@@ -155,7 +154,8 @@ class Aside(logging.Handler):
                 failed += 1
             # Reported where the gap is: entries that still wait are older than those that were lost.
             if (lost := self._lost + failed) > told and self._waiting.empty():
-                report = _entry(f"{lost - told} entries were not written: the log accepted no text then")
+                entries = counted(lost - told, "entry", "was")
+                report = _entry(f"{entries} not written: the log accepted no text then")
                 if self._is_accepted(self.format(report)):
                     told = lost
             if isinstance(entry, threading.Event):

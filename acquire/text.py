@@ -45,6 +45,21 @@ def shortened(text: object, characters: int = 120) -> str:
     return shown if len(shown) <= characters else f"{shown[: characters - 1]}…"
 
 
+_OF_SEVERAL = {"was": "were", "is": "are", "has": "have", "does": "do", "follows": "follow", "finds": "find"}
+
+
+def counted(number: int, noun: str, verb: str = "") -> str:
+    """Return "1 line", "3 lines"; with the verb "was": "1 line was", "3 lines were".
+
+    Of a noun such as "line of it", the first part has the plural.
+    """
+    if number != 1:
+        head, of, rest = noun.partition(" of ")
+        noun = f"{head[:-1]}ies{of}{rest}" if head.endswith("try") else f"{head}s{of}{rest}"
+        verb = _OF_SEVERAL.get(verb, verb)
+    return f"{number} {noun} {verb}".rstrip()
+
+
 def did_you_mean(word: str, possible: Iterable[str]) -> str:
     """Return ``; did you mean 'start'?`` for a word close to a possible one, else an empty text."""
     near = difflib.get_close_matches(word, list(possible), n=1)

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from acquire.text import cause_in_words, shortened, visible
+from acquire.text import cause_in_words, counted, shortened, visible
 
 
 @pytest.mark.parametrize(
@@ -52,3 +52,10 @@ def test_a_cut_is_marked() -> None:
 )
 def test_exceptions_are_said_without_the_names_of_classes(error: Exception, words: str) -> None:
     assert cause_in_words(error) == words
+
+
+def test_one_is_singular() -> None:
+    assert [counted(n, "line", "was") for n in (0, 1, 2)] == ["0 lines were", "1 line was", "2 lines were"]
+    assert [counted(n, "entry") for n in (1, 2)] == ["1 entry", "2 entries"]
+    assert counted(3, "line of it", "is") == "3 lines of it are"
+    assert counted(2, "line", "came") == "2 lines came"

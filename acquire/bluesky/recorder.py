@@ -28,6 +28,7 @@ from acquire.daemon.messages import StartRequest, fault_error
 from acquire.errors import DataError, DeviceError, NoDaemonError, PlaceError, StateError, UsageError
 from acquire.store import RunCondition, open_recording
 from acquire.store.attributes import segment_of
+from acquire.text import counted
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
@@ -318,12 +319,12 @@ class Recorder(Device, Stageable, Preparable, Flyable, Collectable, WritesStream
         condition, reason = attrs["run_condition"], attrs["end_reason"]
         if condition in (RunCondition.ABORTED, RunCondition.INTERRUPTED):
             raise DeviceError(
-                f"{self.name}: {path} is {condition}, {account.reach} lines: {reason}",
+                f"{self.name}: {path} is {condition}, {counted(account.reach, 'line')}: {reason}",
                 hint="acquire verify lists the lines that it holds; check the cause, then run the plan again",
             )
         if account.budget is not None and account.reach < account.budget:
             raise DeviceError(
-                f"{self.name}: {path} has {account.reach} of {account.budget} lines: {reason}",
+                f"{self.name}: {path} has {account.reach} of {counted(account.budget, 'line')}: {reason}",
                 hint="acquire verify lists the lines that it holds; check the cause, then run the plan again",
             )
         if len(account.uncovered) > 1:

@@ -9,6 +9,7 @@ import numpy as np
 from acquire.errors import UsageError
 from acquire.lines import ARMS
 from acquire.noise import robust_sigma
+from acquire.text import counted
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -213,7 +214,8 @@ def warn_of_drift(found: Moments) -> list[str]:
 def warn_of_exclusions(usable: NDArray[np.bool_], reason: str) -> list[str]:
     """Warn of columns that are left out."""
     count = int((~usable).sum())
-    return [f"{count} columns are left out for their {reason}"] if count else []
+    of = "its" if count == 1 else "their"
+    return [f"{counted(count, 'column', 'is')} left out for {of} {reason}"] if count else []
 
 
 def warn_of_later_corrections(known: Calibration) -> list[str]:

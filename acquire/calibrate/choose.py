@@ -13,6 +13,7 @@ from acquire.calibrate.file import open_calibration
 from acquire.calibrate.orientation import MODEL, view_named
 from acquire.errors import AcquireError, ConfigError, PlaceError
 from acquire.lines import ARMS
+from acquire.text import counted
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -58,7 +59,7 @@ def corrected(known: Calibration) -> list[str]:
         if name in known.quantities:
             found.append(words)
     if known.usable is not None and not known.usable.all():
-        found.append(f"{int((~known.usable).sum())} columns left out")
+        found.append(f"{counted(int((~known.usable).sum()), 'column')} left out")
     if known.orientation is not None and (view := view_named(known.orientation)) != MODEL:
         shown = " (the video is what camera B sees)" if view.swapped else ""
         found.append(f"the orientation: {view.name}{shown}")

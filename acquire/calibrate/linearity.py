@@ -26,6 +26,7 @@ from acquire.calibrate.exposure import moments, no_progress
 from acquire.converter import ConverterCurve
 from acquire.errors import UsageError
 from acquire.lines import ARMS
+from acquire.text import counted
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -229,7 +230,7 @@ def _ramps(
                 kept.append((ticks, light, noise, float(variance.mean())))
         if len(kept) < FEWEST_LEVELS:
             raise UsageError(
-                f"arm {arm} has {len(kept)} levels of light that are neither dark nor saturated",
+                f"arm {arm} has {counted(len(kept), 'level of light')} neither dark nor saturated",
                 possible=f"{FEWEST_LEVELS} or more, with the light on for different parts of a sub-step",
                 hint="acquire calibrate linearity records them; light the scene to 60 to 95 % of white",
             )

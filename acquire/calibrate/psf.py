@@ -31,6 +31,7 @@ from acquire.calibrate.still import stills
 from acquire.errors import UsageError
 from acquire.lines import ARMS
 from acquire.noise import robust_sigma
+from acquire.text import counted
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -131,7 +132,8 @@ def widths(edges: list[Edge], arm: str) -> tuple[NDArray[np.float64], NDArray[np
     Raises UsageError if the edges do not determine both variances.
     """
     if len(edges) < FEWEST:
-        raise _undetermined(arm, f"only {len(edges)} windows contain just one straight, sharp, slanted edge")
+        windows = counted(len(edges), "window")
+        raise _undetermined(arm, f"only {windows} with just one straight, sharp, slanted edge")
     design = np.array([each.normal for each in edges]) ** 2
     variances = np.array([each.variance for each in edges])
     errors = np.array([each.uncertainty for each in edges])

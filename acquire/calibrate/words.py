@@ -9,6 +9,7 @@ import numpy as np
 from acquire.blur import falling
 from acquire.calibrate.apply import CLEAR, belongs_to_flat
 from acquire.calibrate.calibration import Measured
+from acquire.text import counted
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -35,7 +36,7 @@ PER_COLUMN = {
 
 def found_facts(found: Finding) -> dict[str, Any]:
     """Describe a finding: name → value and uncertainty, in words."""
-    facts: dict[str, Any] = {"step": f"{found.step}, {found.facts.get('lines', 0)} lines"}
+    facts: dict[str, Any] = {"step": f"{found.step}, {counted(found.facts.get('lines', 0), 'line')}"}
     facts |= _quantities(found.quantities)
     if found.step == "flat":
         facts["arm A's part of the light"] = f"{found.facts['part_a']:.2%}"
@@ -80,7 +81,7 @@ def known_facts(known: Calibration) -> dict[str, Any]:
     }
     facts |= _quantities(known.quantities)
     if known.usable is not None and not known.usable.all():
-        facts["left out"] = f"{int((~known.usable).sum())} columns"
+        facts["left out"] = counted(int((~known.usable).sum()), "column")
     if known.orientation is not None:
         facts["arm B sees the scene with"] = known.orientation
     if known.alignment is not None:
@@ -89,7 +90,7 @@ def known_facts(known: Calibration) -> dict[str, Any]:
     if "shading" in known.quantities and not belongs_to_flat(known):
         facts["the lens's light"] = "not used: measured with another flat; repeat acquire calibrate align"
     for name, step in known.steps.items():
-        facts[name] = f"{step.get('lines', 0)} lines, {step['made']}" + "".join(
+        facts[name] = f"{counted(step.get('lines', 0), 'line')}, {step['made']}" + "".join(
             f"; {text}" for text in step.get("warnings", ())
         )
     return facts

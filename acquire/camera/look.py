@@ -12,6 +12,7 @@ import numpy as np
 from acquire.camera.settings import describe
 from acquire.errors import CameraError
 from acquire.lines import LineFlag
+from acquire.text import counted
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
@@ -88,7 +89,7 @@ def snapshot(
     while end < lines:
         if time.monotonic() > deadline:
             raise CameraError(
-                f"only {end} of {lines} lines came in {timeout_s:g} s",
+                f"only {end} of {counted(lines, 'line')} came in {timeout_s:g} s",
                 hint="check the line triggers, or set TriggerMode to Off (acquire camera features)",
             )
         block = camera.next_block(_WAIT_S)

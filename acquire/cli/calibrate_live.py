@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 from acquire.cli.output import note, print_facts, print_warning
 from acquire.daemon.who import LONGEST, WHO
 from acquire.errors import DataError, StateError, UsageError
+from acquire.text import counted
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping
@@ -99,7 +100,7 @@ def record(
         if missing <= MOST_LOST * lines:
             return open_exposure(path)
         ended = f"{made.attrs['run_condition']}: {made.attrs['end_reason']}"
-        print_warning(f"{path} lacks {missing} lines of {lines} per arm ({ended})")
+        print_warning(f"{path} lacks {counted(missing, 'line')} of {lines} per arm ({ended})")
     raise DataError(
         f"{TRIES} recordings lacked lines, the last one {missing} of {lines} per arm ({ended})",
         possible=f"up to {int(MOST_LOST * lines)} missing lines of both arms together",

@@ -10,7 +10,7 @@ from rich.table import Table
 from rich.text import Text
 
 from acquire.cli.output import quantity
-from acquire.text import visible
+from acquire.text import counted, visible
 
 if TYPE_CHECKING:
     from rich.console import RenderableType
@@ -105,7 +105,10 @@ def advice(reading: Reading | None) -> str:
         return "no lines are arriving: is the trigger running, and its cable connected to the camera's input?"
     # In the order of urgency: the first that applies is shown.
     for wrong, text in (
-        (reading.lost > 0, f"{reading.lost} lines were lost: check acquire status and the camera's settings"),
+        (
+            reading.lost > 0,
+            f"{counted(reading.lost, 'line', 'was')} lost: check acquire status and the camera's settings",
+        ),
         ((reading.saturated or 0.0) > SATURATED, "saturated: use less light or a smaller aperture"),
         (reading.level < DARK, "dark: is the light on and the lens open?"),
         (reading.level < DIM, "dim: use more light or a larger aperture"),

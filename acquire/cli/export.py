@@ -13,6 +13,7 @@ from acquire.cli.output import JsonFlag, print_json, print_warning, quantity, sa
 from acquire.cli.progress import stage_progress
 from acquire.cli.stretch import FirstLineOption, FromOption, LinesOption, ToOption, lines_between
 from acquire.errors import UsageError
+from acquire.text import counted
 
 if TYPE_CHECKING:
     from acquire.store import VideoFile
@@ -121,9 +122,10 @@ def export(
             f"{out.name} does not hold the estimated error of the regions; .ome.tif, .h5 and .npz files do"
         )
     if content.untrusted:
+        of = counted(content.image.shape[0], "frame")
+        are = "is" if content.untrusted == 1 else "are"
         print_warning(
-            f"{content.untrusted} of {content.image.shape[0]} frames are not trusted, as they are sampled in "
-            "part"
+            f"{content.untrusted} of {of} {are} not trusted: sampled in part only",
         )
 
 

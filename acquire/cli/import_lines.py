@@ -16,6 +16,7 @@ from acquire.cli.moments import utc_ns
 from acquire.cli.output import JsonFlag, print_json, print_warning, say
 from acquire.cli.progress import stage_progress
 from acquire.errors import UsageError
+from acquire.text import counted
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -186,7 +187,8 @@ def import_lines(
         facts = {"path": str(done.path), "lines": done.lines, "arms": done.arms, "unknown": done.unknown}
         print_json(facts)
         return
-    say(f"{done.path}: {done.lines} lines of arm{'s' * (len(done.arms) - 1)} {' and '.join(done.arms)}")
+    whose = f"arm{'s' * (len(done.arms) - 1)} {' and '.join(done.arms)}"
+    say(f"{done.path}: {counted(done.lines, 'line')} of {whose}")
     for text in done.unknown:
         print_warning(f"not known: {text}")
     say(f"  to check the lines against the code: acquire diagnose {done.path}")

@@ -9,6 +9,7 @@ from acquire.cli.output import print_table, say
 from acquire.cli.progress import stage_progress
 from acquire.cli.reconstruct_request import requested_lines
 from acquire.errors import UsageError
+from acquire.text import counted
 
 if TYPE_CHECKING:
     from acquire.calibrate.choose import Chosen
@@ -47,7 +48,8 @@ def explain_calibration(
     # Returned and not printed: with a video, both are in one document.
     if json:
         return facts
-    which = f"{count} lines from line {segment.first_line}" + ("" if tile is None else f" of tile {tile}")
+    of = "" if tile is None else f" of tile {tile}"
+    which = f"{counted(count, 'line')} from line {segment.first_line}{of}"
     say(f"calibration: {chosen.origin}; {which}, voxels {voxels}")
     rows = []
     for worth in found:

@@ -85,7 +85,7 @@ def _outcome_facts(outcome: Outcome) -> dict[str, Any]:
     solved = sum(part["trusted"] for part in facts["segments"])
     ended = None
     if outcome.interrupted:
-        ended = f"the video has {done} of {total} sub-segments, of which {done - solved} are unfinished"
+        ended = f"the video has {done} of {total} sub-segments, {done - solved} of them unfinished"
     elif outcome.cut:
         ended = f"the time limit was reached after {done} of {total} sub-segments"
 

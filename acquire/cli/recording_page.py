@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from acquire.cli.output import quantity
 from acquire.store import taint_words
-from acquire.text import shortened
+from acquire.text import counted, shortened
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -61,7 +61,7 @@ def recording_facts(facts: dict[str, Any]) -> dict[str, Any]:
     continues = calibration = None
     if segment is not None:  # it continues a recording after an outage
         outage = segment["outage"]
-        lost = "the numbering restarted" if outage["lines"] is None else f"{outage['lines']} lines"
+        lost = "the numbering restarted" if outage["lines"] is None else counted(outage["lines"], "line")
         continues = f"{segment['of']} after line {outage['after_line']}; outage: {lost}, {outage['cause']}"
     if missing is not None:
         calibration = f"none: {missing}, named in the rig file, did not exist"

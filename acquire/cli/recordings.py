@@ -16,6 +16,7 @@ from acquire.cli.recording_page import COLUMNS, LISTED, list_row, recording_fact
 from acquire.cli.stretch import FirstLineOption, FromOption, LinesOption, ToOption, lines_between
 from acquire.cli.tiles import TileOption, tile_of
 from acquire.errors import AcquireError, DataError, UsageError
+from acquire.text import counted
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -62,10 +63,11 @@ def list_recordings(
     Example: [bold]acquire ls /data[/]
     """
     from acquire.store import open_outline
+    from acquire.store.listing import candidates
     from acquire.store.refusals import refused
 
     with refused(directory, "listed", "a directory of recordings; `acquire info` describes one"):
-        named = sorted(path for path in directory.iterdir() if path.name.endswith(".zarr"))
+        named = candidates(directory)
         # A recording was named itself, and not a directory of them.
         if (directory / "zarr.json").is_file():
             named = [directory.absolute()]  # "." has no name to list
@@ -127,7 +129,7 @@ def verify(recording: PlaceArgument, json: JsonFlag = False) -> None:
     else:
         verdict = "DAMAGED" if not found.intact else "recovered" if found.recovered else "intact"
         size = quantity(found.bytes, "B")
-        say(f"{found.path}: {verdict}; {found.state}, {found.lines} lines, {size}")
+        say(f"{found.path}: {verdict}; {found.state}, {counted(found.lines, 'line')}, {size}")
         # Lists end after `LISTED` items: a recording on a failing disk may have thousands.
         _print_list("not intact on disk", map(str, found.damage))
         _print_list("lost, flagged as missing", map(str, found.recovered))
@@ -154,9 +156,9 @@ def recover(recording: RecordingArgument, json: JsonFlag = False) -> None:
         print_json(done.to_dict())
         return
     added = done.lines - done.lines_before
-    found = f"; {added} lines were on disk that no commit listed" if added else ""
+    found = f"; {counted(added, 'line', 'was')} on disk that no commit listed" if added else ""
     what = f"recovered and sealed{found}" if done.changed else "nothing to recover"
-    say(f"{done.path}: {done.lines} lines, {what}")
+    say(f"{done.path}: {counted(done.lines, 'line')}, {what}")
     if done.root_rebuilt:
         say("  its root zarr.json was lost and has been rewritten from the copy of its attributes")
     if done.not_listed:
@@ -181,7 +183,9 @@ def hold(
     ] = None,
     begin: FromOption = None,
     end: ToOption = None,
-    why: Annotated[str, typer.Option(metavar="TEXT", help="Reason, stored with the held lines.")] = "",
+    why: Annotated[
+        str, typer.Option(metavar="TEXT", help="Reason, stored with the held lines (up to 200 characters).")
+    ] = "",
     json: JsonFlag = False,
 ) -> None:
     """Keep lines of an endless recording, and the neighbours needed to reconstruct them, from being dropped.
@@ -235,7 +239,7 @@ def upload(
     def report(done: Mirrored) -> None:
         if not json:
             # Standard output is for the result.
-            say(f"{url}: {done.lines} lines, {quantity(done.bytes, 'B')} copied", err=True)
+            say(f"{url}: {counted(done.lines, 'line')}, {quantity(done.bytes, 'B')} copied", err=True)
 
     with stage_progress(f"copying {recording.name}") as progress:
         done = mirror(recording, url, follow=follow, report=report, progress=progress)
@@ -243,7 +247,7 @@ def upload(
         print_json(done.to_dict())
     else:
         state = "sealed" if done.sealed else "still growing"
-        say(f"{url}: {done.lines} lines, {state}; {quantity(done.bytes, 'B')} copied now")
+        say(f"{url}: {counted(done.lines, 'line')}, {state}; {quantity(done.bytes, 'B')} copied now")
 
 
 def cut(
@@ -293,7 +297,7 @@ def cut(
     # Retention may have dropped the first lines of an endless recording.
     first = opened.first_available_line if first is None else first
     count = opened.first_line + opened.lines - first if count is None else count
-    with stage_progress(f"cutting {count} lines"):
+    with stage_progress(f"cutting {counted(count, 'line')}"):
         segment = opened.cut(first, count, tile_of(opened, tile))
         if merge != 1:
             segment = merged(segment, merge)

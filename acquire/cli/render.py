@@ -10,6 +10,7 @@ import typer
 from acquire.cli.output import JsonFlag, print_json, quantity, say
 from acquire.cli.progress import stage_progress
 from acquire.errors import UsageError
+from acquire.text import counted
 
 SHEET_FRAMES, MOVIE_FRAMES = 12, 300
 SHEET_HEIGHT, MOVIE_HEIGHT = 192, 384
@@ -90,4 +91,4 @@ def render(
     if json:
         print_json({"path": str(out), "frames": shown, "bytes": size})
     else:
-        say(f"{out}: {shown} frames, {quantity(size, 'B')}")
+        say(f"{out}: {counted(shown, 'frame')}, {quantity(size, 'B')}")

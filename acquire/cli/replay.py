@@ -15,6 +15,7 @@ from acquire.cli.places import SOCKET, private_directory
 from acquire.cli.progress import stage_progress
 from acquire.cli.recordings import PlaceArgument
 from acquire.errors import AcquireError, DataError, UsageError
+from acquire.text import counted
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterator
@@ -250,7 +251,7 @@ def _record(stored: Recording, out: Path, speed: float) -> str | None:
         return (
             "no recording was made"
             if last is None
-            else f"the recording ended after {last.lines} lines: {last.end_reason}"
+            else f"the recording ended after {counted(last.lines, 'line')}: {last.end_reason}"
         )
     again, dropped = open_recording(out), sum(map(len, stored.dropped_rows()))
     for arm in again.arms:  # are more lines missing than in the original?

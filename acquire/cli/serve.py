@@ -58,7 +58,7 @@ def serve(
     import threading
 
     from acquire.cli.interrupts import leave_signals_to_the_server
-    from acquire.config import find, load_rig, parse_settings
+    from acquire.config import find, find_again, load_rig, parse_settings
     from acquire.daemon.host import check_host
     from acquire.daemon.server import serve as run_daemon
     from acquire.daemon.uploads import check_upload
@@ -76,6 +76,10 @@ def serve(
         check_host(rig)
         return rig
 
+    def reread() -> RigConfig:
+        find_again(path)
+        return read()
+
     # Before the daemon begins: a rig that cannot be used is an error of the command.
     rig = read()
     check_upload(rig)
@@ -85,7 +89,7 @@ def serve(
     if owned:
         # A daemon thread, since it is blocked until the owner ends: nothing could join it.
         threading.Thread(target=end_with_owner, name="acquire-owner", daemon=True).start()
-    raise typer.Exit(run_daemon(rig, str(path), read))
+    raise typer.Exit(run_daemon(rig, str(path), reread))
 
 
 def end_with_owner() -> None:

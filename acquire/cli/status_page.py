@@ -7,6 +7,7 @@ from pathlib import PurePath
 from typing import TYPE_CHECKING, Any
 
 from acquire.cli.output import fact_lines, print_json, quantity, say, table_lines
+from acquire.text import counted
 
 if TYPE_CHECKING:
     from acquire.daemon.messages import Status
@@ -41,8 +42,8 @@ def status_lines(status: Facts) -> list[str]:
     last = status["last"]
     if last is not None:
         condition = last["condition"] or "not sealed"
-        last = f"{last['path']}, {last['lines']} lines, {condition} ({last['end_reason']})"
-    troubles = [f"{one['text']} ({one['times']} times)" for one in status["troubles"][-TROUBLES:]]
+        last = f"{last['path']}, {counted(last['lines'], 'line')}, {condition} ({last['end_reason']})"
+    troubles = [f"{one['text']} ({counted(one['times'], 'time')})" for one in status["troubles"][-TROUBLES:]]
     facts = {
         "state": f"{status['state']} since {since:%Y-%m-%d %H:%M:%S} UTC",
         "busy": status["busy"],
@@ -54,7 +55,7 @@ def status_lines(status: Facts) -> list[str]:
         "last": last,
         "not sealed": _recoveries(status),
         "uploads": _uploads(status),
-        "disk": _disk(status["disk"]),
+        "disk": _trouble_with_disk(status) or _disk(status["disk"]),
         "trigger": _trigger(status["trigger"]),
         "sustains": _capacity(status),
         "calibration": status["calibration"] and status["calibration"]["text"],
@@ -77,8 +78,9 @@ def status_line(status: Facts) -> str:
     # Of the fuller one, which is the first to have no room.
     full = max((arm["ring"]["fill"] / arm["ring"]["slots"] for arm in arms.values()), default=0.0)
     now = status["recording"]
-    recording = f", {PurePath(now['path']).name} {now['recorded_lines']} lines" if now else ""
-    more = f", {status['busy'] or status['waiting']}" if status["busy"] or status["waiting"] else ""
+    recording = f", {PurePath(now['path']).name} {counted(now['recorded_lines'], 'line')}" if now else ""
+    waits = status["busy"] or status["waiting"] or _trouble_with_disk(status)
+    more = f", {waits}" if waits else ""
     return f"{status['state']}{recording}, lost {lost}, rings {full:.0%}{more}"
 
 
@@ -121,13 +123,13 @@ def _uploads(status: Facts) -> str | None:
     """Uploads of recordings to the remote store, with the unfinished ones last."""
     shown = [f"WARNING: {status['upload_warning']}"] if status["upload_warning"] else []
     if status["uploads_left"] > UPLOADS:
-        shown.append(f"{status['uploads_left']} recordings are not copied yet")
+        shown.append(f"{counted(status['uploads_left'], 'recording', 'is')} not copied yet")
     for one in sorted(status["uploads"], key=lambda one: one["state"] != "copied")[-UPLOADS:]:
         waiting = f", {one['waiting_lines']} not yet copied" if one["waiting_lines"] else ""
         why = f": {one['error']}" if one["error"] else ""
         hint = f" (try: {one['hint']})" if one["error"] and one["hint"] else ""
         name = PurePath(one["path"]).name
-        shown.append(f"{name} {one['state']}, {one['lines']} lines copied{waiting}{why}{hint}")
+        shown.append(f"{name} {one['state']}, {counted(one['lines'], 'line')} copied{waiting}{why}{hint}")
     return "; ".join(shown) or None
 
 
@@ -160,7 +162,12 @@ def _trigger(trigger: Facts | None) -> str | None:
     clock = (
         f"clock {quantity(trigger['clock_hz'], 'Hz')}, UTC known to {trigger['uncertainty_ns'] / 1000:.3g} us"
     )
-    return f"{answers}, {trigger['pulses']} lines, {clock}"
+    return f"{answers}, {counted(trigger['pulses'], 'line')}, {clock}"
+
+
+def _trouble_with_disk(status: Facts) -> str | None:
+    trouble = status.get("disk_trouble")
+    return trouble and f"WARNING: {trouble}"
 
 
 def _disk(disk: Facts | None) -> str | None:

@@ -20,6 +20,7 @@ from acquire.cli.trigger_device import ConfigOption, SetOption, UrlOption, devic
 from acquire.cli.trigger_patterns import blink, square
 from acquire.codes import ListedCode
 from acquire.errors import TriggerError
+from acquire.text import counted
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -171,7 +172,7 @@ def stop(
     if json:
         print_json({"lines": lines})
         return
-    say(f"stopped after {lines} lines")
+    say(f"stopped after {counted(lines, 'line')}")
 
 
 def selftest(

@@ -63,20 +63,34 @@ def find(name: str | Path, beside: Path | None = None, kind: str = "") -> Path:
         if os.path.isfile(path):  # noqa: PTH113  # Path.is_file raises for names that no file can have
             return path
     have = ", ".join(builtin_names(kind))
-    if name and os.path.isdir(name):  # noqa: PTH112
-        why = "is a directory"
-    elif not _may_look_at(name):
-        why = "is in a directory that this user may not enter"
-    else:
-        # A link whose target is gone is a file to `lexists`, and none to `isfile`.
-        why = "is not a regular file" if os.path.lexists(name) else "does not exist"
-        if os.path.islink(name) and not os.path.exists(name):  # noqa: PTH110, PTH114
-            why = f"is a link to {shown(os.readlink(name))}, which leads to no file"  # noqa: PTH115
     what = f"{kind} file" if kind else "configuration file"
     near = did_you_mean(str(name), builtin_names(kind))
     raise ConfigError(
-        f"{what} {shown(str(name))} {why}{near}", possible=f"a path, or one of the built-in {have}"
+        f"{what} {shown(str(name))} {_why_no_file(name)}{near}",
+        possible=f"a path, or one of the built-in {have}",
     )
+
+
+def find_again(path: Path) -> None:
+    """Raise ConfigError if the rig file that a service was started with is not there any more."""
+    if not path.is_file():
+        raise ConfigError(
+            f"rig file {shown(str(path))}, with which the service was started, {_why_no_file(path)}: "
+            "the service goes on with what it has read",
+            hint="put the file back, or restart the service with another --config while it is idle",
+        )
+
+
+def _why_no_file(name: str | Path) -> str:
+    """Return what is wrong with the path of a file, as the end of a sentence."""
+    if name and os.path.isdir(name):  # noqa: PTH112
+        return "is a directory"
+    if not _may_look_at(name):
+        return "is in a directory that this user may not enter"
+    # A link whose target is gone is a file to `lexists`, and none to `isfile`.
+    if os.path.islink(name) and not os.path.exists(name):  # noqa: PTH110, PTH114
+        return f"is a link to {shown(os.readlink(name))}, which leads to no file"  # noqa: PTH115
+    return "is not a regular file" if os.path.lexists(name) else "does not exist"
 
 
 def _may_look_at(name: str | Path) -> bool:

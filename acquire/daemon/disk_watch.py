@@ -1,4 +1,4 @@
-"""How long the disk of the recordings lasts.
+"""Whether recordings can begin in the configured directory, and how long its disk lasts.
 
 A query of a file system that is gone, such as a network share whose server does not answer, may block for
 ever. So a separate thread makes it, and the status keeps the latest answer.
@@ -15,6 +15,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from acquire.daemon.messages import DiskStatus
+from acquire.daemon.usable import Place, Trouble, trouble, unreachable
+from acquire.errors import StoreError
 from acquire.lines import ARMS
 from acquire.store.remote import shares_disk
 
@@ -29,6 +31,10 @@ WINDOW_S = 60.0
 """The rate at which the disk fills is the mean over this time."""
 LEAST_S = 5.0
 """Duration of a recording before its measured rate is used."""
+SILENT_S = 10.0
+"""Time after which a disk that does not answer is reported."""
+REFUSAL_S = 1.0
+"""Time that a start waits for the disk's answer: it may have gone, or come back, since the last one."""
 
 
 def disk_watch(config: RigConfig) -> DiskWatch:
@@ -37,11 +43,12 @@ def disk_watch(config: RigConfig) -> DiskWatch:
     per_s = len(ARMS) * line_bytes * config.passing_hz
     if shares_disk(config.recording.upload_to, config.recording.directory.absolute()):
         per_s *= 2  # the copies fill it as well
-    return DiskWatch(config.recording.directory.absolute(), config.recording.reserve_bytes, per_s)
+    directory = config.recording.directory.absolute()
+    return DiskWatch(directory, config.recording.reserve_bytes, per_s, look=Place(directory).look)
 
 
 class DiskWatch:
-    """Queries the directory's disk from time to time; `check` never waits.
+    """Queries the directory and its disk from time to time; `check` never waits.
 
     Parameters
     ----------
@@ -57,11 +64,15 @@ class DiskWatch:
         expected_bytes_per_s: float,
         free_bytes: Callable[[Path], int] = lambda path: shutil.disk_usage(path).free,
         now_s: Callable[[], float] = time.monotonic,
+        look: Callable[[], Trouble | None] = lambda: None,
     ) -> None:
         self._directory = directory
         self._reserve_bytes = reserve_bytes
         self._expected = expected_bytes_per_s
         self._free_bytes = free_bytes
+        self._look = look
+        self._trouble: Trouble | None = None
+        self._was_away = False
         self._now_s = now_s
         self._looks: deque[tuple[float, int]] = deque()
         self._changing = threading.Lock()
@@ -84,25 +95,49 @@ class DiskWatch:
             return
         if self._now_s() - self._asked_s < LOOK_EVERY_S:
             return
+        self._begin()
+
+    def refuse(self, path: Path) -> None:
+        """Raise StoreError if ``path`` is in the directory, and no recording can begin there now."""
+        if not path.is_relative_to(self._directory):
+            return
+        if self._thread is None or not self._thread.is_alive():
+            self._begin()
+        assert self._thread is not None
+        self._thread.join(REFUSAL_S)
+        if (found := self.trouble) is not None:
+            raise StoreError(found.text, hint=found.hint)
+
+    def came_back(self) -> bool:
+        """Return whether the directory can be used again, once after each time that it could not."""
+        back = self._was_away and self.trouble is None
+        self._was_away = self.trouble is not None
+        return back
+
+    def _begin(self) -> None:
         self._asked_s = self._now_s()
         self._thread = threading.Thread(target=self._ask, name="disk-watch", daemon=True)
         self._thread.start()
 
     def _ask(self) -> None:
+        free = 0
         try:
-            free = self._free_bytes(self._directory)
-        except OSError:  # gone or inaccessible: the status becomes None
-            with self._changing:
-                self._looks.clear()
-            return
+            found = self._look()
+            free = 0 if found else self._free_bytes(self._directory)
+        except OSError as error:
+            found = unreachable(self._directory, error)
         with self._changing:
+            self._trouble = found
+            if found is not None:
+                self._looks.clear()  # another disk may come back
+                return
             self._looks.append((self._now_s(), free))
             while self._looks[0][0] < self._looks[-1][0] - WINDOW_S:
                 self._looks.popleft()
 
     @property
     def status(self) -> DiskStatus | None:
-        """Latest answer; None before the first one, and if the disk cannot be queried."""
+        """Latest answer; None before the first one, and while no recording can begin there."""
         with self._changing:
             looks = list(self._looks)
         if not looks:
@@ -117,6 +152,15 @@ class DiskWatch:
             bytes_per_s=rate,
             seconds_to_full=max(0, free - self._reserve_bytes) / rate,
         )
+
+    @property
+    def trouble(self) -> Trouble | None:
+        """Why no recording can begin in the directory, and what helps; None if one can."""
+        silent_s = self._now_s() - self._asked_s
+        if self._thread is not None and self._thread.is_alive() and silent_s > SILENT_S:
+            why = f"its disk has not answered for {silent_s:.0f} s"
+            return trouble(self._directory, why, "the kernel's log, and the disk's cable or server")
+        return self._trouble
 
     def close(self) -> None:
         """Wait a moment for the current query; a thread that hangs is left behind."""

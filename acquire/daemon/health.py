@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Literal
 
 from acquire.daemon.facts import Health, HealthCheck
 from acquire.daemon.states import State
+from acquire.text import counted
 
 if TYPE_CHECKING:
     from acquire.daemon.messages import ArmStatus, DiskStatus, Status
@@ -37,7 +38,7 @@ def health_of(status: Status, line_rate_hz: float, age_s: float = 0.0) -> Health
     if status.state is State.FAULTED:
         level, sentence = "fault", f"Fault: {status.fault}"
     elif lost:
-        level, sentence = "lost", f"{lost} lines were lost since the instrument was armed."
+        level, sentence = "lost", f"{counted(lost, 'line', 'was')} lost since the instrument was armed."
     elif _RANK[worst.level]:
         level, sentence = "degraded", f"Nothing is lost; {worst.text}."
     elif status.state is State.IDLE:
@@ -115,7 +116,7 @@ def _code(name: str, arm: ArmStatus) -> HealthCheck:
 
 
 def _of_service(status: Status) -> list[HealthCheck]:
-    found = [disk_check(status.disk)]
+    found = [disk_check(status.disk, status.disk_trouble)]
     if (held := held_check(status)) is not None:
         found.append(held)
     if status.trigger is not None:
@@ -135,7 +136,7 @@ def _of_service(status: Status) -> list[HealthCheck]:
         found.append(HealthCheck(name="capacity", level="warning", text=status.capacity.warning))
     failing = next((one for one in status.uploads if one.error), None)
     if failing is not None:
-        text = f"{status.uploads_left} recordings are not copied: {failing.error}"
+        text = f"{counted(status.uploads_left, 'recording', 'is')} not copied: {failing.error}"
         found.append(HealthCheck(name="uploads", level="warning", text=text, value=status.uploads_left))
     if status.troubles:
         found.append(HealthCheck(name="troubles", level="warning", text=status.troubles[-1].text))
@@ -161,9 +162,11 @@ def held_check(status: Status) -> HealthCheck | None:
     )
 
 
-def disk_check(disk: DiskStatus | None) -> HealthCheck:
-    """Judge how long the disk lasts."""
+def disk_check(disk: DiskStatus | None, trouble: str | None = None) -> HealthCheck:
+    """Judge how long the disk lasts; with ``trouble``, nothing can be recorded on it."""
     limit = f"good from {DISK_GOOD_S / 3600:.0f} h on, bad below {DISK_BAD_S / 60:.0f} min"
+    if trouble is not None:
+        return HealthCheck(name="disk", level="bad", text=trouble, limit=limit)
     if disk is None:
         return HealthCheck(name="disk", level="unknown", text="the disk has not answered yet", limit=limit)
     left_s = disk.seconds_to_full

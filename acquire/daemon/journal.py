@@ -13,6 +13,7 @@ from acquire.errors import StateError, UsageError
 from acquire.processes.lockfile import LockFile
 from acquire.reading import read_object
 from acquire.store.files import NO_LOCKS, Publisher
+from acquire.text import counted
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
@@ -83,7 +84,7 @@ class Journal:
             log.error("%s does not say what is %s: %s", self._file, self._what, error)  # noqa: TRY400 - no traceback
             return []
         if (odd := len(named) - len(paths)) > 0:
-            log.error("%s: %d entries are not absolute paths, or too many", self._file, odd)
+            log.error("%s: %s no absolute path, or too many", self._file, counted(odd, "entry", "is"))
         self._written = paths
         return [Path(path) for path in paths]
 

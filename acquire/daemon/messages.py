@@ -351,7 +351,14 @@ class Status(Message):
     )
     fault: Text | None
     trigger: TriggerStatus | None = Field(default=None, description="null: not armed")
-    disk: DiskStatus | None = Field(default=None, description="null: it has not answered yet")
+    disk: DiskStatus | None = Field(
+        default=None, description="null: it has not answered yet, or see `disk_trouble`"
+    )
+    disk_trouble: Text | None = Field(
+        default=None,
+        description="why no recording can begin in the configured directory, and what to do: it is not "
+        "there, its disk is not mounted, it may not be written, or the disk does not answer",
+    )
     capacity: CapacityStatus | None = None
     calibration: CalibrationStatus | None = Field(
         default=None, description="null: not armed, or the rig names none"

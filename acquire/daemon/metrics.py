@@ -94,6 +94,8 @@ class _Metrics(Collector):
 
     def _of_places(self) -> Iterator[Metric]:
         status = self._status
+        usable = int(status.disk_trouble is None)
+        yield _gauge("acquire_directory_usable", "1 while recordings can begin there.", [((), usable)])
         if (disk := status.disk) is not None:
             yield _gauge("acquire_disk_free_bytes", "Free on the recordings' disk.", [((), disk.free_bytes)])
             yield _gauge(

@@ -21,6 +21,7 @@ from typing import TYPE_CHECKING, Any, cast, get_args
 from acquire.daemon.facts import Level, News, NewsKind
 from acquire.daemon.health import disk_check, held_check
 from acquire.daemon.states import State
+from acquire.text import counted
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -81,7 +82,7 @@ class NewsLog:
             # A client that continues after news that are gone must learn that it missed some.
             text = "the daemon was restarted: earlier news are in its log and in the recordings"
             if ours:
-                text = f"{first - 1 - seen} news are not kept any more"
+                text = f"{counted(first - 1 - seen, 'earlier event', 'is')} not kept any more"
             made, now = f"{self.life}-{first - 1}", datetime.now(UTC)
             return [News(id=made, time=now, kind="missed", text=text, state=self._state), *news]
 
@@ -131,7 +132,7 @@ class Changes:
                 if lines <= reported or self._now_s() - at_s < LOSSES_EVERY_S:
                     continue
                 self._lost[arm, cause] = lines, self._now_s()
-                text = f"arm {arm} lost {lines - reported} lines: {cause.replace('_', ' ')}"
+                text = f"arm {arm} lost {counted(lines - reported, 'line')}: {cause.replace('_', ' ')}"
                 found.append(_fact("loss", text, "error", arm=arm, lines=lines - reported))
         if before is not None and same_run:
             found += _verdicts(before, status)
@@ -143,7 +144,7 @@ class Changes:
         known = {one.text: one.times for one in before.troubles} if before else {}
         new = [one for one in status.troubles if one.times > known.get(one.text, 0)]
         troubles = [_fact("trouble", one.text, "error") for one in new]
-        found += self._disk_level(status) + _held(before, status) + troubles
+        found += _directory(before, status) + self._disk_level(status) + _held(before, status) + troubles
         # Only the beginning and the end of a wait are news: its text changes every second.
         waited = bool(before and before.waiting)
         if status.waiting and not waited:
@@ -166,6 +167,17 @@ class Changes:
 
 def _fact(kind: NewsKind, text: str, level: Level = "info", **more: Any) -> dict[str, Any]:
     return {"kind": kind, "text": text, "level": level, **more}
+
+
+def _directory(before: Status | None, after: Status) -> list[dict[str, Any]]:
+    """Report when the recordings' directory cannot be used any more, and when it can be used again."""
+    was, now = before.disk_trouble if before else None, after.disk_trouble
+    # Without what changes every second, such as for how long a disk has not answered.
+    if bool(was) == bool(now):
+        return []
+    text = now or "recordings can begin in the configured directory again"
+    log.log(logging.ERROR if now else logging.INFO, "%s", text)
+    return [_fact("disk", text, "error" if now else "info")]
 
 
 def _held(before: Status | None, after: Status) -> list[dict[str, Any]]:

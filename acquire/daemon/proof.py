@@ -70,7 +70,10 @@ class Proof:
             return CapacityStatus(line_rate_hz=rate_hz, warning=f"not measured: {error}")
         load = parts.load
         tight = parts.line_rate_hz * TIGHT < load.line_rate_hz
-        warning = f"{_configured(load)}; {_sustained(parts)}" if tight else None
+        little = "less than" if parts.line_rate_hz < load.line_rate_hz else "hardly more than"
+        warning = (
+            f"this host sustains {little} is configured: {_sustained(parts)}; configured: {_configured(load)}"
+        )
         # Simulated cameras wait for a busy host, but cannot do with too few processors.
         limit_hz = parts.limits["processors"] if self._config.simulates_cameras else parts.line_rate_hz
         if limit_hz < load.line_rate_hz and not force:
@@ -79,7 +82,7 @@ class Proof:
                 possible=f"{_sustained(parts)}; the best of {TRIES} measurements at a load of {_load()}",
                 hint="end other programs, try another codec or directory (acquire bench), or arm --force",
             )
-        if warning:
+        if tight:
             log.warning("capacity: %s", warning)
         return CapacityStatus(
             line_rate_hz=load.line_rate_hz,
@@ -87,7 +90,7 @@ class Proof:
             sustained_hz=round(parts.line_rate_hz),
             limit=parts.limit,
             limits_hz={name: round(rate) for name, rate in parts.limits.items()},
-            warning=warning,
+            warning=warning if tight else None,
         )
 
     def _parts(self, progress: Callable[[str], object]) -> Parts:
@@ -122,5 +125,11 @@ def _configured(load: Load) -> str:
 
 
 def _sustained(parts: Parts) -> str:
-    limits = ", ".join(f"{name} {rate:.3g}" for name, rate in parts.limits.items())
-    return f"{parts.line_rate_hz:.3g} lines/s, limited by {parts.limit} (lines/s: {limits})"
+    limits = ", ".join(f"{name} {_three_digits(rate)}" for name, rate in parts.limits.items())
+    rate = _three_digits(parts.line_rate_hz)
+    return f"{rate} lines/s, limited by {parts.limit} (lines/s: {limits})"
+
+
+def _three_digits(rate: float) -> str:
+    """Return a rate with three digits that count, and without an exponent."""
+    return f"{float(f'{rate:.3g}'):.12g}"

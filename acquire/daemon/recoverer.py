@@ -18,10 +18,12 @@ from acquire.store import READABLE, Circumstances, recover
 from acquire.store.files import DISK, locked
 from acquire.store.host import has_run_on, is_here
 from acquire.store.links import refuse_link, refuse_links
+from acquire.store.listing import candidates
 from acquire.store.opening import read_root
 from acquire.store.rebuild import known_attributes, root_is_lost
 from acquire.store.removal import Unborn, remove, shards_on_disk
 from acquire.store.source import LocalSource
+from acquire.text import counted
 
 if TYPE_CHECKING:
     from collections.abc import Collection
@@ -65,7 +67,7 @@ def search(directory: Path, recorded: Collection[Path] = ()) -> Found:
 
     Raises OSError if the directory cannot be read.
     """
-    paths = sorted(path for path in directory.iterdir() if path.name.endswith(".zarr"))
+    paths = candidates(directory)
     known, found = set(recorded), Found([], [])
     for path in dict.fromkeys([*paths, *recorded]):
         try:
@@ -90,10 +92,18 @@ def _look_at(path: Path, found: Found, *, noted: bool) -> None:
             )
             found.odd.append(RecoveryStatus(path=path, state="gone", text=text))
         else:
-            found.odd.append(RecoveryStatus(path=path, state="left", text=error.message))
+            found.odd.append(RecoveryStatus(path=path, state="left", text=_without(path, error.message)))
         return
     if attributes.get("format") in READABLE and attributes.get("state") == "recording":
         found.open.append(path)
+
+
+def _without(path: Path, message: str) -> str:
+    """Return an error about a path for a text that begins with its name."""
+    if path.is_symlink() and not path.exists():
+        return f"it is a link to {path.readlink()}, which does not exist"
+    rest = message.removeprefix(str(path))
+    return message if rest == message else f"it{rest}" if rest.startswith(" ") else rest.removeprefix(": ")
 
 
 def salvage(mailbox: Mailbox, task: RecoveryTask) -> None:
@@ -125,12 +135,13 @@ def _salvage(mailbox: Mailbox, task: RecoveryTask) -> RecoveryStatus:
     except FileNotFoundError:
         return RecoveryStatus(path=path, state="gone", text=_gone(task))
     except (AcquireError, OSError) as error:
-        lost = f"; {task.committed_lines} lines of it were acknowledged" if task.committed_lines else ""
+        acknowledged = counted(task.committed_lines, "line of it", "was")
+        lost = f"; {acknowledged} acknowledged" if task.committed_lines else ""
         return RecoveryStatus(path=path, state="failed", text=f"{error}{lost}")
     sealed = read_root(LocalSource(path))["attributes"]
     text = str(sealed["end_reason"])
     if done.lines < task.committed_lines:
-        text += f"; of {task.committed_lines} acknowledged lines only {done.lines} are on disk"
+        text += f"; of {counted(task.committed_lines, 'acknowledged line')} only {done.lines} on disk"
     for lost in done.tables_lost.values():
         text += f"; {lost}"
     if done.not_listed:
@@ -144,7 +155,7 @@ def _gone(task: RecoveryTask) -> str:
     if not task.committed_lines:
         return "it is not there; no line of it was committed"
     return (
-        f"it is not there any more, and {task.committed_lines} lines of it were acknowledged: "
+        f"it is not there any more, and {counted(task.committed_lines, 'line of it', 'was')} acknowledged: "
         "was its disk unmounted, or the directory moved or removed?"
     )
 

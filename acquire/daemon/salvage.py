@@ -43,6 +43,8 @@ MOST_LISTED = 32
 """Number of latest recordings in the status: more than one run can leave."""
 MOST_ODD = 8
 """Number of entries of the directory in the status that are not recordings."""
+_MAY_COME_BACK = ("gone", "failed")
+"""States of recordings that another search may find whole: their disk was not mounted, or had failed."""
 _END_S = 5.0
 _POLL_S = 0.02
 
@@ -76,8 +78,14 @@ class Salvage:
         return list(self._found.values())
 
     def search(self) -> None:
-        """Start a search for recordings that a killed daemon has left; `poll` takes its result."""
-        self._not_sealed = dict.fromkeys(self._journal.read())
+        """Start a search for recordings that a killed daemon has left; `poll` takes its result.
+
+        Again once the directory is back, with the journal that it has.
+        """
+        if self._searching is not None:
+            return
+        self._not_sealed = dict.fromkeys([*self._journal.read(), *self._not_sealed])
+        self._journal.write(self._not_sealed)
         # In a thread: a directory of thousands, or on a slow disk, must not delay the daemon's start.
         thread = ThreadPoolExecutor(1, "salvage")
         self._searching = thread.submit(search, self._directory, list(self._not_sealed))
@@ -165,7 +173,8 @@ class Salvage:
             log.warning("%d more like these in %s", len(found.odd) - MOST_ODD, self._directory)
         for path in found.open:
             # A search on a slow disk may meet what a run has begun since: that is not left by anybody.
-            if path not in self._found and path not in self._begun:
+            known = self._found.get(path)
+            if (known is None or known.state in _MAY_COME_BACK) and path not in self._begun:
                 self._queue(RecoveryTask(path))
         # What the journal names and the search met neither open nor odd is sealed by now.
         met = {*found.open, *(one.path for one in found.odd)}

@@ -23,7 +23,7 @@ from acquire.daemon.plan import default_path, recording_of
 from acquire.daemon.report import Rates, arm_statuses, seconds_since, trigger_status
 from acquire.daemon.salvage import Salvage
 from acquire.daemon.states import Event, Situation, State, after, commands, possible
-from acquire.daemon.take import Take, log_event
+from acquire.daemon.take import Take, and_then, in_words, log_event, with_cause
 from acquire.daemon.troubles import Troubles
 from acquire.daemon.uploads import Uploads
 from acquire.errors import AcquireError, StateError, UsageError
@@ -91,8 +91,9 @@ class Service:
         """Return the latest published status; never waits."""
         # These change even while the devices' thread waits for a device and publishes nothing.
         ages = {"uptime_s": seconds_since(self._born), "state_s": seconds_since(self._now.since_s)}
-        others = {"troubles": self.troubles.statuses, "disk": self._disk.status}
-        return self._status.model_copy(update=ages | others)
+        trouble = self._disk.trouble
+        disk = {"disk": self._disk.status, "disk_trouble": None if trouble is None else str(trouble)}
+        return self._status.model_copy(update=ages | disk | {"troubles": self.troubles.statuses})
 
     def ring_places(self) -> tuple[str | None, dict[str, tuple[str, RingShape]]]:
         """Return the run's ID, and per arm the path and shape of its ring's memory."""
@@ -180,10 +181,9 @@ class Service:
 
     def measure(self) -> None:
         """Measure again what the host sustains; only while idle, since a run would disturb it."""
-        if self._now.state is not State.IDLE:
-            raise StateError(
-                f"measuring is impossible while {self._now.state}", possible=possible(self._now.state)
-            )
+        state = self._now.state
+        if state is not State.IDLE:
+            raise StateError(f"measuring is impossible while {state}", possible=possible(state))
         if self._prove is None:
             raise UsageError("this rig's capacity cannot be measured", hint="acquire bench --config RIG")
         self._now.busy = "capacity"
@@ -216,7 +216,7 @@ class Service:
         beside: tuple[tuple[str, Callable[[], object]], ...] = (
             ("recoveries", lambda: self._recovered(self._salvage.poll(capturing=self._run is not None))),
             ("uploads", self._uploads.poll),
-            ("disk", lambda: self._disk.check(recording=self._now.state is State.RECORDING)),
+            ("disk", self._check_disk),
         )
         for what, work in beside:
             try:
@@ -238,6 +238,11 @@ class Service:
             self.troubles.note("watching the capture", error)
             self._fail(self._with_cause(f"defect in the daemon: {error!r}"))
         self._publish()
+
+    def _check_disk(self) -> None:
+        self._disk.check(recording=self._now.state is State.RECORDING)
+        if self._disk.came_back():
+            self._salvage.search()  # it may have brought recordings that were left open
 
     def shutdown(self) -> None:
         """Seal and release, whatever the state. Bounded in time; raises only errors of closing a run."""
@@ -315,13 +320,15 @@ class Service:
     def _begin(self, begin: Begin, *, by_event: bool = False) -> None:
         assert self._run is not None
         # First, so that a refused start leaves no trace in the journals.
-        self._run.capture.start(begin)
         path, lines = begin.path, begin.budget_lines
+        self._disk.refuse(path)
+        self._run.capture.start(begin)
         self._salvage.began(path)
         self._uploads.forget(path)
         self._uploads.add(path)
-        self._take = Take(path, lines, by_event)
-        self._go(Event.START, f"{path}, {'until stopped' if lines is None else f'{lines} lines'}")
+        before = None if self._seen.path == str(path) else self._seen.path
+        self._take = Take(path, lines, by_event, before=before)
+        self._go(Event.START, self._take.in_words)
 
     def _try_event(self, note: Note) -> None:
         """Handle an event; if its recording cannot be created, the next event is still waited for."""
@@ -365,20 +372,14 @@ class Service:
         if aborted:
             self._fail(f"the recording was aborted: {self._seen.end_reason}{take.marks_after(self._seen)}")
             return
-        last = self._last
-        why = f"{last.path}, {last.lines} lines, {last.condition}, {last.end_reason}" if last else ""
+        why = in_words(self._last) if self._last else ""
         self._go(Event.SEALED if stays else Event.RELEASED, why)
         # An event that came while the recording of its predecessor was being sealed was postponed.
         if stays and take.late is not None:
             self._try_event(take.late)
 
     def _with_cause(self, trouble: str) -> str:
-        """Return the text of a failure, after its probable cause: the reason why the recording ended."""
-        seen, cause = self._seen, self._seen.fault
-        ending = self._now.state in (State.RECORDING, State.DRAINING)
-        if cause is None and ending and seen.condition is not RunCondition.GOOD:
-            cause = seen.end_reason
-        return f"{cause}; then, while ending: {trouble}" if cause else trouble
+        return with_cause(trouble, self._seen, ending=self._now.state in (State.RECORDING, State.DRAINING))
 
     def _fail(self, text: str) -> None:
         """Publish the fault at once, release the devices, and wait until it is read."""
@@ -387,7 +388,7 @@ class Service:
         try:
             self._release()
         except AcquireError as error:
-            self._now.fault = f"{text}; then, while ending: {error}"
+            self._now.fault = and_then(text, str(error))
         self._go(Event.FAULT, self._now.fault)
 
     def _release(self) -> None:

@@ -11,10 +11,11 @@ from typing import TYPE_CHECKING
 
 from acquire.daemon.messages import LastRecording, RecordingStatus
 from acquire.logs import EACH
-from acquire.text import shortened
+from acquire.store import RunCondition
+from acquire.stream import CaptureStatus
+from acquire.text import counted, shortened
 
 if TYPE_CHECKING:
-    from acquire.stream import CaptureStatus
     from acquire.stream.messages import Note
 
 
@@ -37,6 +38,24 @@ def log_event(note: Note, take: Take | None) -> None:
         take.marks.append(note)
 
 
+def with_cause(trouble: str, seen: CaptureStatus, *, ending: bool) -> str:
+    """Return the text of a failure, after its probable cause: the reason why the recording ended."""
+    cause = seen.fault
+    if cause is None and ending and seen.condition is not RunCondition.GOOD:
+        cause = seen.end_reason
+    return and_then(cause, trouble) if cause else trouble
+
+
+def in_words(last: LastRecording) -> str:
+    """Return the result of a recording as one line for log and news."""
+    return f"{last.path}, {counted(last.lines, 'line')}, {last.condition}, {last.end_reason}"
+
+
+def and_then(cause: str, trouble: str) -> str:
+    """Return the text of a failure with what went wrong after it, unless that is the same."""
+    return cause if trouble in cause else f"{cause}; then, while ending: {trouble}"
+
+
 @dataclass(slots=True)
 class Take:
     """One recording, from its start until it is sealed.
@@ -47,6 +66,7 @@ class Take:
     lines : its budget; None: until it is stopped
     by_event : an event started it, and later events prolong it
     late : the first event that came too late to prolong it
+    before : path of the recording before it, if that is another
     marks : the latest marks since its start
     """
 
@@ -54,9 +74,15 @@ class Take:
     lines: int | None
     by_event: bool = False
     late: Note | None = None
+    before: str | None = None
     marks: deque[Note] = field(default_factory=lambda: deque(maxlen=MOST_MARKS))
     _progress: tuple[int, int] = (-1, -1)
     _moved_s: float = field(default_factory=time.monotonic)
+
+    @property
+    def in_words(self) -> str:
+        """The request, for log and news."""
+        return f"{self.path}, {'until stopped' if self.lines is None else counted(self.lines, 'line')}"
 
     def idle_s(self, seen: CaptureStatus) -> float:
         """Return the seconds since it last made progress in the recorder or on disk."""
@@ -66,10 +92,16 @@ class Take:
             self._progress, self._moved_s = progress, time.monotonic()
         return time.monotonic() - self._moved_s
 
+    def path_now(self, seen: CaptureStatus) -> Path:
+        """Return its own path, or that of the segment in which it continues."""
+        return self.path if seen.path in (None, self.before) else Path(seen.path)
+
     def status(self, seen: CaptureStatus) -> RecordingStatus:
         """Return the status of the recording while it is being written."""
+        if seen.path == self.before:  # of the recording before it, as long as nothing of this one was seen
+            seen = CaptureStatus()
         return RecordingStatus(
-            path=Path(seen.path or self.path),
+            path=self.path_now(seen),
             first_line=seen.first_line,
             budget_lines=self.lines,
             recorded_lines=seen.recorded_lines,
@@ -89,10 +121,10 @@ class Take:
 
     def result(self, seen: CaptureStatus) -> LastRecording:
         """Return the result for the daemon's status, once the recording has ended, and log what it lacks."""
-        path = Path(seen.path or self.path)
+        path = self.path_now(seen)
         if more := seen.ledger.get("events_not_listed"):
-            text = "%s does not list its last %d events: their table is full; this log has all marks"
-            log.warning(text, path, more)
+            text = "%s does not list its last %s: their table is full; this log has all marks"
+            log.warning(text, path, counted(more, "event"))
         return LastRecording(
             path=path,
             lines=seen.committed_lines,

@@ -29,6 +29,7 @@ from acquire.store.attributes import upload_target
 from acquire.store.opening import read_root
 from acquire.store.remote import check_url, url_below
 from acquire.store.source import LocalSource
+from acquire.text import counted
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -248,8 +249,9 @@ class Uploads:
                 if message.error and known != (message.state, message.error):
                     log.warning("upload of %s %s: %s", message.path, message.state, message.error)
                 elif message.state == "copied":
-                    text = "upload of %s: %d lines are in %s"
-                    log.info(text, message.path, message.lines, message.url, extra=EACH)
+                    text = "upload of %s: %s in %s"
+                    lines = counted(message.lines, "line", "is")
+                    log.info(text, message.path, lines, message.url, extra=EACH)
                 if message.state in ("copying", "copied"):  # the store can be reached
                     self.warning = None
                 self._list(message)

@@ -12,6 +12,7 @@ from acquire.evaluate.page import fill_template
 from acquire.evaluate.player import beside, clip_of
 from acquire.evaluate.themed import GRID, SOLVER_COLOURS, STYLE, Drawing, canvas, drawing_of
 from acquire.showing import error_in_words
+from acquire.text import counted
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -89,7 +90,7 @@ def _account(panel: Panel) -> dict[str, Any]:
     of_parts = [text for part in parts for text in part["warnings"]]  # older videos have only these
     return {
         "name": panel.name,
-        "size": f"{count} frames of {rows} × {columns}, {file.interval_ns / 1e3:.6g} µs each",
+        "size": f"{counted(count, 'frame')} of {rows} × {columns}, {file.interval_ns / 1e3:.6g} µs each",
         "trusted": None if file.trusted is None else [file.trusted.start, file.trusted.stop - 1],
         "known": {key: known.get(key) for key in KNOWN},
         "error": error_in_words(known["error"]) if known.get("error") else None,

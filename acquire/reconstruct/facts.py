@@ -9,6 +9,7 @@ import numpy as np
 
 from acquire.recon.error import error_facts
 from acquire.recon.judge import POOR_MISFIT
+from acquire.text import counted
 
 if TYPE_CHECKING:
     from acquire.recon import Reconstruction
@@ -45,7 +46,5 @@ def why_not_trusted(result: Reconstruction, what: str) -> str | None:
     if result.ended != "stopped" and (result.ended != "budget" or missed <= POOR_MISFIT):
         return None
     ended = "stopped" if result.ended == "stopped" else "ended by its budget"
-    return (
-        f"{what} was {ended} after {result.iterations} iterations and leaves a misfit of {missed:.0%}: it is "
-        "not trusted"
-    )
+    ran = counted(result.iterations, "iteration")
+    return f"{what} was {ended} after {ran} and leaves a misfit of {missed:.0%}: it is not trusted"

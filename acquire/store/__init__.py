@@ -2,7 +2,7 @@
 
 ::
 
-    whole recordings   writer                     reader              verification recovery mirroring  video
+    whole recordings   writer                     reader, listing     verification recovery mirroring  video
       with             retention room resume      outline suspect     scan         mend     place
       kept from loss   removal, links             opening attributes  compare      rebuild
       seen at once     overview                   extent shortfall

@@ -24,6 +24,7 @@ import numpy as np
 
 from acquire.lines import ARMS
 from acquire.store.present import MISSING, flags_of, present_values
+from acquire.text import counted
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -53,7 +54,7 @@ class Difference:
         if self.array == ROWS:
             return f"the recording has {self.first} rows, and the copy {self.second}"
         return (
-            f"{self.array} differs in {self.rows} rows, first in row {self.row}: {self.first}, "
+            f"{self.array} differs in {counted(self.rows, 'row')}, first in row {self.row}: {self.first}, "
             f"and {self.second} in the copy"
         )
 

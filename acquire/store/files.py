@@ -221,6 +221,14 @@ class Disk:
         finally:
             os.close(fd)
 
+    def reserve_more(self, path: Path, size: int) -> None:
+        """Make a file of `reserve` larger; it keeps what it has if the disk refuses."""
+        fd = os.open(path, os.O_WRONLY | os.O_NOFOLLOW | os.O_CLOEXEC)
+        try:
+            os.posix_fallocate(fd, 0, size)
+        finally:
+            os.close(fd)
+
     def rename(self, source: Path, target: Path) -> None:
         """Replace ``target`` in one step."""
         source.replace(target)

@@ -28,12 +28,14 @@ from acquire.store.attributes import segment_of
 from acquire.store.files import DISK, SCRATCH, locked
 from acquire.store.layout import PARSE_ERRORS, group_document, to_json
 from acquire.store.links import refuse_link, refuse_links
+from acquire.store.listing import ROOT
 from acquire.store.reader import open_recording
 from acquire.store.refusals import refusal
 from acquire.store.remote import RemoteSource
-from acquire.store.removal import ROOT, shard_files
+from acquire.store.removal import shard_files
 from acquire.store.retention import keep_from, release
 from acquire.store.shortfall import first_shortfall
+from acquire.text import counted
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -108,7 +110,7 @@ def mirror(
             if time.monotonic() - moved > idle_s:
                 raise DataError(
                     f"{path} has not grown for {idle_s:g} s and is not sealed",
-                    possible=f"{done.lines} lines are in {copying.target}",
+                    possible=f"{counted(done.lines, 'line', 'is')} in {copying.target}",
                     hint=f"acquire recover {path}, then copy again",
                 )
         return done

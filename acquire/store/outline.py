@@ -20,6 +20,7 @@ from acquire.store.files import DISK, is_locked
 from acquire.store.opening import opened
 from acquire.store.source import LocalSource, source_of
 from acquire.store.table_reader import read_events, read_gaps, salvage_events
+from acquire.text import counted
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -226,12 +227,12 @@ class Outline:
         found = [f"{_WITHOUT.get(name, name)}: {text}" for name, text in self.tables_lost.items()]
         if self.events_not_listed:
             found.append(
-                f"{self.events_not_listed} of the last events found no room in the table: "
+                f"the last {counted(self.events_not_listed, 'event')} found no room in the table: "
                 "the daemon's log has all marks"
             )
         if self.gaps_not_listed:
             found.append(
-                f"{self.gaps_not_listed} of the last gaps found no room in the table: "
+                f"the last {counted(self.gaps_not_listed, 'gap')} found no room in the table: "
                 "the ledger and the flags of the lines have all that were lost"
             )
         return found

@@ -24,6 +24,7 @@ from acquire.lines import ARMS, LineFlag
 from acquire.store import layout
 from acquire.store.codecs import check_size, crc32c, decode, encode
 from acquire.store.shape import CRC_BYTES, ArrayShape, codec_of
+from acquire.text import counted
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
@@ -198,7 +199,7 @@ def contradictions(recording: Recording, arm: str) -> Iterator[str]:
     if found is None:
         return
     if wrong := sum(_differ(recording, arm, found, rows) for rows in _groups(recording, found)):
-        yield f"{arm}: {wrong} rows of the overview are not the mean of their lines"
+        yield f"{arm}: {counted(wrong, 'row of the overview', 'is')} not the mean of the lines"
 
 
 def _groups(recording: Recording, found: Overview) -> Iterator[range]:

@@ -27,6 +27,7 @@ from acquire.store.outline import Outline
 from acquire.store.overview import read_overview
 from acquire.store.present import present_values
 from acquire.store.source import source_of
+from acquire.text import counted
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -264,7 +265,8 @@ class Recording(Outline):
                 if self.lines
                 else "no lines yet"
             )
-            raise UsageError(f"{lines} lines from line {first_line} on are not all there", possible=have)
+            wanted = counted(lines, "line")
+            raise UsageError(f"{wanted} from line {first_line} on cannot be read in full", possible=have)
         return start, start + lines
 
     def _camera_numbers(self, key: str) -> list[float]:

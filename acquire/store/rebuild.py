@@ -20,8 +20,8 @@ from acquire.lines import ARMS
 from acquire.reading import read_object
 from acquire.store import layout, overview
 from acquire.store.files import SCRATCH, Publisher
+from acquire.store.listing import COPY, ROOT
 from acquire.store.refusals import CURES
-from acquire.store.removal import COPY, ROOT
 from acquire.store.table import event_table, gap_table
 from acquire.text import cause_in_words
 

@@ -52,6 +52,7 @@ from acquire.store.scan import (
 from acquire.store.shortfall import Damage
 from acquire.store.spec import RunCondition
 from acquire.store.table import event_table, gap_table
+from acquire.text import counted
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -221,11 +222,12 @@ class _Recoverer:
         """Take from the tables that cannot be read what is whole, and note what is lost."""
         if "events" in self.recording.unreadable:
             self.events, wrong = self.recording.salvaged_events()
-            kept = f"{len(self.events)} events were kept without it" if self.events else "no event was kept"
+            count = len(self.events)
+            kept = f"{counted(count, 'event', 'was')} kept without it" if count else "no event was kept"
             self.tables_lost["events"] = f"{'; '.join(wrong)}; {kept}"
         if self.gaps_lost:
             count = sum(map(len, new_gaps.values()))
-            lost = f"; {count} gaps were listed from the flags, their causes are lost"
+            lost = f"; {counted(count, 'gap', 'was')} listed from the flags, without the cause"
             if self.recording.dropped:
                 lost += ", and so are the gaps among the lines that retention had dropped"
             self.tables_lost["gaps"] += lost
@@ -317,7 +319,7 @@ class _Recoverer:
             if recording.first_line <= line < end and (line, kind, note) not in listed:
                 events.add({"tick": self._tick(line), "line": line, "kind": kind, "text": note})
                 listed.add((line, kind, note))
-        texts = [f"{self.rows} lines, {recording.lines} of them were committed"]
+        texts = [f"{counted(self.rows, 'line')}, of which {recording.lines} committed"]
         for text in (*texts, *self.tables_lost.values()):
             events.add({"tick": 0, "line": end, "kind": "recovered", "text": text})
         for table in (gaps, events):

@@ -11,7 +11,9 @@ from acquire.lines import ARMS
 from acquire.store.files import SCRATCH
 from acquire.store.layout import line_columns
 from acquire.store.links import refuse_link, refuse_links
+from acquire.store.listing import COPY, ROOT
 from acquire.store.shape import shard_key
+from acquire.text import counted
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -19,11 +21,8 @@ if TYPE_CHECKING:
 
     from acquire.store.files import Disk
 
-ROOT = "zarr.json"
 RESERVE = ".reserve"
 """File that keeps room for a recording's end while it is written, next to the shards of the first array."""
-COPY = ".attributes"
-"""Copy of the root's attributes, next to the shards of the first array; see `acquire.store.rebuild`."""
 _MADE_FIRST = {ROOT, SCRATCH, RESERVE, COPY}
 """Files that exist before the first line; all others hold lines, or belong to somebody else."""
 
@@ -52,7 +51,7 @@ def remove(disk: Disk, path: Path, proof: Unborn | Dropped) -> None:
         case Unborn(committed_lines):
             if committed_lines:
                 raise DataError(
-                    f"{path} is not removed: {committed_lines} lines of it were committed",
+                    f"{path} is not removed: {counted(committed_lines, 'line of it', 'was')} committed",
                     hint="acquire recover, which seals it with these lines",
                 )
             refuse_links(path)

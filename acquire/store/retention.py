@@ -29,6 +29,7 @@ from acquire.store.refusals import refusal
 from acquire.store.remote import url_below
 from acquire.store.removal import Dropped, remove, shard_files
 from acquire.store.terms import ALL_LINES
+from acquire.text import counted
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -40,6 +41,10 @@ _NOT_COPIED = "not copied yet"
 
 HOLDS = ".holds"
 """Directory of the files of `hold`, placed where no Zarr reader lists names."""
+
+
+LONGEST_WHY = 200
+"""Longest reason for a hold, in characters: the recording's root lists them all."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,6 +68,10 @@ def hold(path: Path, first_line: int, count: int, why: str = "", disk: Disk = DI
     """
     if first_line < 0 or count < 1:
         raise UsageError(f"{count} lines from line {first_line} on cannot be held", possible="1 line or more")
+    if len(why) > LONGEST_WHY:
+        raise UsageError(
+            f"a hold cannot have a reason of {len(why)} characters", possible=f"up to {LONGEST_WHY}"
+        )
     recording = open_recording(path)
     if recording.state == "sealed":
         raise UsageError(
@@ -123,7 +132,7 @@ def holds_of(path: Path) -> list[Hold]:
             facts = read_object(file, follow=False)
             held = Hold(int(facts["first_line"]), int(facts["count"]), str(facts["why"]))
             if min(held.first_line, held.count) < 0:  # listed in the root, it would make that invalid
-                raise ValueError(f"it is for {held.count} lines from line {held.first_line}")
+                raise ValueError(f"it is for {counted(held.count, 'line')} from line {held.first_line}")
             found.append(held)
         except FileNotFoundError:
             continue  # replaced by a wider one, or released, in the meantime

@@ -22,6 +22,7 @@ from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any
 
 from acquire.flags import ARMS
+from acquire.text import counted
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -35,9 +36,9 @@ VERIFIED = {arm: f"code_verified_{arm}" for arm in ARMS}
 CODE_EVENTS = frozenset((*DOUBTFUL.values(), *VERIFIED.values()))
 
 _TAINTS = {
-    "incomplete": "lines that arrived damaged",
-    "unconfirmed": "lines that no tag of the trigger confirmed",
-    "code_contradicted": "lines that contradict the code",
+    "incomplete": "that arrived damaged",
+    "unconfirmed": "that no tag of the trigger confirmed",
+    "code_contradicted": "against the code",
 }
 
 
@@ -81,7 +82,7 @@ def taint_words(counts: Mapping[str, int]) -> list[str]:
     for name, count in counts.items():
         kind, _, arm = name.rpartition("_")
         if arm in ARMS and kind in _TAINTS:
-            reasons.append(f"arm {arm}: {count} {_TAINTS[kind]}")
+            reasons.append(f"arm {arm}: {counted(count, 'line')} {_TAINTS[kind]}")
         else:
             reasons.append(f"{name.replace('_', ' ')}: {count}")
     return reasons

@@ -20,7 +20,7 @@ from acquire.store.scan import chunks_of, missing_rows, scan
 from acquire.store.shortfall import Damage, missing_segments
 from acquire.store.source import LocalSource, source_of
 from acquire.store.suspect import suspect_lines
-from acquire.text import cause_in_words
+from acquire.text import cause_in_words, counted
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -139,10 +139,11 @@ def _contradictions(recording: Recording, scans: dict[str, ArmScan]) -> Iterator
             yield f"{arm}: arrays of {sorted(lengths)} lines"
         flagged, misnumbered = _read_tags(recording, found)
         if misnumbered:
-            yield f"{arm}: {misnumbered} lines have a code index that is not S times their number"
+            lines = counted(misnumbered, "line", "has")
+            yield f"{arm}: {lines} a code index that is not S times the line's number"
         every, kept = listed[arm]
         if complete and flagged is not None and flagged != kept:
-            yield f"{arm}: {flagged} lines are flagged as missing, {kept} are listed in gaps"
+            yield f"{arm}: {counted(flagged, 'line', 'is')} flagged as missing, gaps list {kept}"
         yield from _unbalanced(recording, arm, every if complete else None)
         yield from overview.contradictions(recording, arm)
 
@@ -186,12 +187,10 @@ def _unbalanced(recording: Recording, arm: str, listed: int | None) -> Iterator[
         return
     missing = sum(book.get("missing", {}).values())
     if book["stored"] + missing != recording.lines:
-        yield (
-            f"{arm}: the ledger does not balance: {recording.lines} lines, {book['stored']} stored, "
-            f"{missing} missing"
-        )
+        lines = counted(recording.lines, "line")
+        yield f"{arm}: the ledger does not balance: {lines}, {book['stored']} stored, {missing} missing"
     if listed is not None and missing != listed:
-        yield f"{arm}: the ledger has {missing} missing lines, gaps list {listed}"
+        yield f"{arm}: the ledger has {counted(missing, 'missing line')}, gaps list {listed}"
 
 
 def _metadata(recording: Recording) -> Iterator[str]:

@@ -16,7 +16,7 @@ import json
 import os
 import time
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Self
 
@@ -36,6 +36,7 @@ from acquire.store.retention import Keeper, release
 from acquire.store.room import RoomWatch
 from acquire.store.spec import Ending, RunCondition, root_attributes
 from acquire.store.table import event_table, gap_table
+from acquire.text import counted
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -51,6 +52,8 @@ OWN_INTERVAL_S = 1.0
 
 RESERVE_BYTES = 2**21
 """Bytes kept free for the metadata of the end: more than tables (`table.TEXT_BYTES`) and root take."""
+USUAL_ROOT_BYTES = 2**17
+"""Bytes of them for the root; for a larger one, more are reserved."""
 
 
 class RecordingWriter:
@@ -100,6 +103,7 @@ class RecordingWriter:
         self._committed = 0
         self._own_due_s = 0.0
         self._failure: str | None = None
+        self._reserved = RESERVE_BYTES
         self._closed = False
 
     @classmethod
@@ -403,9 +407,21 @@ class RecordingWriter:
     ) -> None:
         """Replace the root, which is the commit itself."""
         root = layout.group_document(self._attributes(ending), nodes)
-        durable = self._durable or ending is not None
-        self._publisher.replace(self.path / "zarr.json", layout.to_json(root), durable=durable)
+        durable, text = self._durable or ending is not None, layout.to_json(root)
+        self._publisher.replace(self.path / "zarr.json", text, durable=durable)
+        if ending is None:
+            self._reserve_for(len(text))
         self._committed = rows  # only now: nothing is acknowledged that a reader would not find
+
+    def _reserve_for(self, root_bytes: int) -> None:
+        """Keep room for the end of a root that has grown: it lists holds, and what was dropped between."""
+        # Root and copy are each written before they replace the old one.
+        if 2 * root_bytes <= self._reserved - RESERVE_BYTES + USUAL_ROOT_BYTES:
+            return
+        more = RESERVE_BYTES + 4 * root_bytes  # enough until it has doubled
+        with suppress(OSError):  # what is reserved stays; the disk is about to end the recording
+            self._disk.reserve_more(self._reserve, more)
+            self._reserved = more
 
     def _publish_copy(self, ending: Ending | None = None) -> None:
         """Write the copy of the root's attributes, in case the root is lost; always before the root."""
@@ -441,7 +457,7 @@ class RecordingWriter:
             )
 
     def _safe(self) -> str:
-        return f"{self._committed} lines of each arm are committed and can be read"
+        return f"{counted(self._committed, 'line of each arm', 'is')} committed and can be read"
 
     @contextmanager
     def _failing(self, doing: str, kind: type[AcquireError] = DataError) -> Iterator[None]:

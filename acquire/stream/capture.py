@@ -32,6 +32,7 @@ from acquire.stream.plan import END_S, CaptureStatus
 from acquire.stream.ring import Ring, RingShape
 from acquire.stream.succession import Succession
 from acquire.stream.supervisor import Supervisor
+from acquire.text import counted
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -341,7 +342,7 @@ class Capture:
         if any(ring.fill == ring.shape.slots for ring in rings):
             return "the rings are full: lines that come now belong to no recording"
         lines = min(ring.room_lines for ring in rings)
-        more = f"{lines * period_ns / 1e9:.0f} s" if period_ns else f"{lines} lines"
+        more = f"{lines * period_ns / 1e9:.0f} s" if period_ns else counted(lines, "line")
         return f"the rings hold {more} more"
 
     def _lost(self, arm: str) -> dict[str, int]:

@@ -19,6 +19,7 @@ from acquire.store.suspect import DOUBTFUL
 from acquire.stream.losses import Cause
 from acquire.stream.messages import Sealed
 from acquire.stream.tagger import UNCONFIRMED
+from acquire.text import cause_in_words
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -308,7 +309,9 @@ class Session:
         except (AcquireError, OSError) as second:
             self._leave_out(self.writer.committed_lines)
             self.writer.close()
-            reason = f"{reason}; not sealed: {_words(second)}"
+            # A disk that is gone refuses both alike, and its words are those of one error.
+            same = _cause(second) == _cause(error)
+            reason += "; nor could it be sealed" if same else f"; not sealed: {_words(second)}"
             return Sealed(RunCondition.ABORTED, reason, self._ledger(), on_disk=False)
 
     def _leave_out(self, rows: int) -> None:
@@ -397,6 +400,12 @@ class Session:
 def _words(error: Exception) -> str:
     """Return the error without its advice, which is out of date by the time somebody reads the recording."""
     return error.message if isinstance(error, AcquireError) else str(error)
+
+
+def _cause(error: Exception) -> str:
+    """Return what the disk said, whatever was being done."""
+    cause = error.__cause__ if isinstance(error.__cause__, OSError) else error
+    return cause_in_words(cause)
 
 
 def _worse(one: RunCondition, other: RunCondition) -> RunCondition:

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 from acquire.lines import ARMS
 from acquire.store import RunCondition
 from acquire.stream.kept import Kept
+from acquire.text import counted
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -220,7 +221,7 @@ def find_stall(
     # An arm may deliver and never catch up: all rows that it lacks would be written in one go at the end.
     if session.skew > max_skew_lines:
         late = min(waited_for, key=lambda name: session.books[name].next_line)
-        return _stall((late,), f"{session.skew} lines behind the other")
+        return _stall((late,), f"{counted(session.skew, 'line')} behind the other")
     return None
 
 

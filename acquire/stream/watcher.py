@@ -27,6 +27,7 @@ from acquire.stream.lightcheck import ArmVerdict, Judge, Sight, Verdict, explain
 from acquire.stream.messages import Checked, Note
 from acquire.stream.observer import Observer
 from acquire.stream.threshold import Threshold
+from acquire.text import counted
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -153,7 +154,7 @@ class Watcher:
             plan, self._report_s = self._plan.threshold, self._now_s + _REPORT_EVERY_S
             assert plan is not None
             text = f"arm {plan.arm} {'above' if plan.rising else 'below'} {plan.level_dn:g} DN"
-            more = f", {self._unreported} more times before" if self._unreported else ""
+            more = f", {counted(self._unreported, 'more time')} before" if self._unreported else ""
             self._unreported = 0
             self._mailbox.post(Note(line, "threshold", text + more))
 

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from acquire.errors import TriggerError
+from acquire.text import counted
 from acquire.trigger import registers as r
 from acquire.trigger.registers import Command, EndReason, State
 from acquire.trigger.settings import Capabilities
@@ -57,7 +58,7 @@ class DeviceStatus:
 
     def __str__(self) -> str:
         reason = self.end_reason.name.lower().replace("_", " ")
-        words = f"{self.state.name.lower()} with {self.lines} lines"
+        words = f"{self.state.name.lower()} with {counted(self.lines, 'line')}"
         return words if self.end_reason == EndReason.NONE else f"{words} ({reason})"
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import deque
 from typing import TYPE_CHECKING, ClassVar
 
+from acquire.text import counted
 from acquire.trigger.base import WATCHDOG, LineTag, TagEvent
 from acquire.trigger.registers import TAG_FIELDS, TIME_BITS, TagFlag
 
@@ -56,7 +57,7 @@ class TagReader:
         self._events: deque[TagEvent] = deque(maxlen=_MOST_EVENTS)
 
     def __str__(self) -> str:
-        return f"run {self._run.run_id!r} with {self.lines_known} lines"
+        return f"run {self._run.run_id!r} with {counted(self.lines_known, 'line')}"
 
     def statistics(self) -> dict[str, int]:
         return dict(self._counts)

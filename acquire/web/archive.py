@@ -31,6 +31,7 @@ from acquire.store import (
 )
 from acquire.store.attributes import upload_target
 from acquire.store.layout import DAMAGE
+from acquire.store.listing import SUFFIX, candidates, is_ours
 from acquire.store.opening import read_root, stated_format
 from acquire.store.refusals import refused
 from acquire.store.retention import holds_of
@@ -85,20 +86,20 @@ class Archive:
         """Name → its root document, and whether it is a video. As the facts, of what is in the directory."""
         self._ranges: OrderedDict[tuple[str, int], tuple[float, float]] = OrderedDict()
 
-    def path_of(self, name: str, suffix: str = ".zarr") -> Path:
+    def path_of(self, name: str, suffix: str = SUFFIX) -> Path:
         """Return the path of an entry. Raises PlaceError if it is not in the directory, or is a link.
 
         ``name``: as in the lists, where a name that is not UTF-8 has escapes.
         """
         # lstat, because a link could lead out of the directory.
         path = self._directory / self._real_name(name)
-        invalid = not name.endswith(suffix) or "\0" in name or name in (".", "..") or Path(name).name != name
+        valid = "\0" not in name and name not in (".", "..") and Path(name).name == name
         try:
-            mode = None if invalid else path.lstat().st_mode
+            # Recordings may have any name.
+            is_there = valid and (is_ours(path) if suffix == SUFFIX else _is_file(path, suffix))
         except OSError:
-            mode = None
-        kind = stat.S_ISDIR if suffix == ".zarr" else stat.S_ISREG
-        if mode is None or not kind(mode):
+            is_there = False
+        if not is_there:
             raise PlaceError(
                 f"there is no {shortened(name)} among the recordings", possible="/api/recordings"
             )
@@ -204,14 +205,14 @@ class Archive:
         """
         there = {}
         try:
-            paths = list(self._directory.iterdir())
+            paths = candidates(self._directory)
         except OSError as error:
             raise PlaceError(f"{self._directory} cannot be listed: {error.strerror}") from error
         for path in paths:
             # Links are left out: lstat never reports one as a directory.
             with suppress(OSError):
                 mode = path.lstat()
-                if path.suffix == ".zarr" and stat.S_ISDIR(mode.st_mode):
+                if stat.S_ISDIR(mode.st_mode):
                     there[path.name] = mode.st_mtime_ns, path
         # Recordings come and go for weeks.
         self._kinds = {name: known for name, known in self._kinds.items() if name in there}
@@ -279,6 +280,11 @@ class _Entry:
     path: Path
     stamp: _Stamp
     root: Document | None = None
+
+
+def _is_file(path: Path, suffix: str) -> bool:
+    """Return whether a path has the suffix, and is a file itself. Raises OSError."""
+    return path.name.endswith(suffix) and stat.S_ISREG(path.lstat().st_mode)
 
 
 def _stamp(path: Path) -> _Stamp:

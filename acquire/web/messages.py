@@ -7,6 +7,7 @@ from typing import Literal
 from pydantic import Field
 
 from acquire.daemon.messages import Message, Text
+from acquire.store.retention import LONGEST_WHY
 
 # The largest whole number up to which those of JavaScript are exact.
 MOST_LINES = 2**53
@@ -86,7 +87,7 @@ class HoldRequest(Message):
 
     first_line: int = Field(strict=True, ge=0, le=MOST_LINES)
     lines: int = Field(strict=True, ge=1, le=MOST_LINES)
-    why: str = Field(default="", max_length=200)
+    why: str = Field(default="", max_length=LONGEST_WHY)
 
 
 class VideoFacts(Message):

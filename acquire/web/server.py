@@ -13,7 +13,7 @@ import uvicorn
 
 from acquire.client import Client
 from acquire.daemon.connections import Connection, raise_descriptor_limit
-from acquire.errors import NoDaemonError, UsageError
+from acquire.errors import NoDaemonError, StoreError, UsageError
 from acquire.processes.rank import EARLY, stand_back
 from acquire.web.app import build_page
 from acquire.web.certificate import tls_context
@@ -143,10 +143,13 @@ def link(config: WebConfig, socket: Path, role: str) -> str:
 
 
 def directory_of(socket: Path) -> Path:
-    """Return the directory of the daemon's recordings. Raises NoDaemonError."""
+    """Return the directory of the daemon's recordings. Raises NoDaemonError, and StoreError if it is away."""
     from pathlib import Path as Directory
 
-    disk = Client(socket).status().disk
+    status = Client(socket).status()
+    disk = status.disk
+    if status.disk_trouble is not None:
+        raise StoreError(status.disk_trouble, hint="again once that is done")
     if disk is None:
         raise NoDaemonError("the daemon has not checked its disk yet", hint="again in a moment")
     return Directory(disk.directory)

@@ -143,7 +143,7 @@ def test_unsuitable_ramps_are_refused(tmp_path: Path) -> None:
     close = {"trigger.light.close_ticks": 450}
     flat = open_exposure(record(tmp_path / "flat.zarr", white(LEVEL, effects), "flat", 64, **close))
     coded = open_exposure(record(tmp_path / "coded.zarr", white(LEVEL, effects), "target", 64, **close))
-    with pytest.raises(UsageError, match="1 levels of light that are neither dark nor saturated"):
+    with pytest.raises(UsageError, match="1 level of light neither dark nor saturated"):
         linearity([flat], known)
     with pytest.raises(UsageError, match="steady light that linearity needs"):
         linearity([flat, coded], known)

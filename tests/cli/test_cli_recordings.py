@@ -135,6 +135,13 @@ def test_ls_survives_recordings_that_cannot_be_described(cli: Cli, recording: Pa
     assert max(len(item.get("error", "")) for item in listed) > CELL_CHARACTERS
 
 
+def test_ls_lists_a_recording_of_any_name(cli: Cli, recording: Path) -> None:
+    write(recording.parent / "take 3")
+    (recording.parent / "older").mkdir()
+    listed = cli("ls", recording.parent, "--json").json
+    assert [Path(item["path"]).name for item in listed] == ["one.zarr", "take 3"]
+
+
 def test_ls_leaves_videos_out(cli: Cli, recording: Path) -> None:
     video, times = np.zeros((2, 4, 4), np.float32), np.arange(2, dtype=np.int64)
     write_video(

@@ -86,7 +86,7 @@ def test_news_that_are_not_kept_any_more_are_reported_as_missed() -> None:
     for text in "abcd":
         log.add("mark", text)
     missed, *others = log.after(seen)
-    assert (missed.kind, missed.text) == ("missed", "2 news are not kept any more")
+    assert (missed.kind, missed.text) == ("missed", "2 earlier events are not kept any more")
     assert [one.text for one in others] == ["c", "d"]
     assert [one.text for one in log.after(missed.id)] == ["c", "d"]  # its id is a place in the log as well
 
@@ -214,6 +214,16 @@ def test_the_service_tells_states_marks_and_faults(tmp_path: Path) -> None:
     service.disarm()
 
 
+def test_a_directory_that_is_away_is_reported_when_it_goes_and_when_it_is_back() -> None:
+    changes = Changes()
+    changes.of(status())
+    (told,) = changes.of(status(disk=None, disk_trouble="no recording can begin in /d: silent for 11 s"))
+    assert (told["kind"], told["level"]) == ("disk", "error")
+    assert not changes.of(status(disk=None, disk_trouble="no recording can begin in /d: silent for 12 s"))
+    (told,) = changes.of(status())
+    assert (told["kind"], told["level"]) == ("disk", "info")
+
+
 @pytest.mark.parametrize(
     ("seen", "level", "words"),
     [
@@ -225,6 +235,7 @@ def test_the_service_tells_states_marks_and_faults(tmp_path: Path) -> None:
         (status(arm_status(saturated_part=0.2)), "degraded", "20.0% of the lines"),
         (status(arm_status(rate_hz=500.0)), "degraded", "500 lines/s of 1000"),
         (status(disk=disk(300.0)), "degraded", "full in 5 min"),
+        (status(disk=None, disk_trouble="/d is away; mount it"), "degraded", "; /d is away; mount it."),
         (status(recording=recording(7)), "degraded", "7 B more than recording.retention.max_gb allows"),
         (status(state=State.FAULTED, fault="no light"), "fault", "no light"),
     ],

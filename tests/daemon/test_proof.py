@@ -71,7 +71,7 @@ def test_a_rate_above_it_is_refused_unless_forced(measured: dict[str, Any], tmp_
     with pytest.raises(UsageError) as refused:
         prove(force=False, progress=said.append)
     assert "33333.3 lines/s" in refused.value.message
-    assert "2e+04 lines/s, limited by recorder" in refused.value.possible
+    assert "20000 lines/s, limited by recorder" in refused.value.possible
     assert "best of 3 measurements at a load of" in refused.value.possible
     assert "--force" in refused.value.hint
     assert [words.split(" (")[0] for words in said] == [

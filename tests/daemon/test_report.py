@@ -11,8 +11,9 @@ import pytest
 from fake_run import CALM
 from waiting import until
 
-from acquire.daemon.disk_watch import LEAST_S, LOOK_EVERY_S, DiskWatch
+from acquire.daemon.disk_watch import LEAST_S, LOOK_EVERY_S, SILENT_S, DiskWatch
 from acquire.daemon.report import RATE_WINDOW_S, Rates, arm_statuses, trigger_status
+from acquire.errors import StoreError
 from acquire.stream import CaptureStatus
 from acquire.stream.ledger import ArmLedger
 
@@ -154,6 +155,23 @@ def test_a_disk_that_does_not_answer_keeps_nobody_waiting() -> None:
     disk.gone = True
     disk.answers.set()
     until(lambda: disk.watch.status is None, "the error")
+    assert "Input/output error" in str(disk.watch.trouble)
+
+
+def test_a_disk_that_does_not_answer_is_reported_and_refuses_a_start() -> None:
+    disk = Disk()
+    disk.check()
+    disk.answers.clear()
+    disk.clock.now_s += LOOK_EVERY_S
+    disk.watch.check(recording=False)
+    assert disk.watch.trouble is None
+    disk.clock.now_s += SILENT_S + 1
+    with pytest.raises(StoreError, match="has not answered for 11 s"):
+        disk.watch.refuse(Path("/d/x.zarr"))
+    disk.watch.refuse(Path("/e/x.zarr"))
+    disk.answers.set()
+    until(lambda: disk.watch.trouble is None, "the answer")
+    assert disk.watch.came_back() is False  # nobody has looked while it was away
 
 
 def test_a_query_that_fails_in_the_middle_of_a_check_does_no_harm() -> None:

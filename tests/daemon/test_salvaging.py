@@ -154,6 +154,16 @@ def test_a_directory_that_is_gone_is_not_called_recovered(salvage: Salvage, tmp_
     assert (tmp_path / "empty.zarr").is_dir()
 
 
+def test_a_recording_of_any_name_is_found_and_recovered(salvage: Salvage, tmp_path: Path) -> None:
+    """Also without the journal, which may be lost with the directory's other hidden files."""
+    leave_open(tmp_path / "take 3", LINES)
+    (leave_open(tmp_path / "no root", LINES) / "zarr.json").unlink()
+    (tmp_path / "older").mkdir()
+    salvage.search()
+    look_until(salvage, lambda: states(salvage) == {"take 3": "recovered", "no root": "recovered"})
+    assert open_recording(tmp_path / "take 3").lines == LINES
+
+
 def test_links_are_not_followed(salvage: Salvage, tmp_path: Path) -> None:
     """Neither where the recording is one, nor where it holds one."""
     (tmp_path / "elsewhere").mkdir()

@@ -136,6 +136,27 @@ def test_budget_in_seconds_rounds_up(bed: Bed) -> None:
     assert bed.run.calls[-1][2] == 334  # 33,333.3 lines per second
 
 
+def test_a_take_is_not_told_as_the_one_before_it(bed: Bed, tmp_path: Path) -> None:
+    """Until the capture was seen again, it had the last one's path and lines, and was news as its segment."""
+    first, second = tmp_path / "first.zarr", tmp_path / "second.zarr"
+    bed.service.arm()
+    bed.service.start(StartRequest(path=first))
+    bed.run.see(path=str(first), recording=True, recorded_lines=100, committed_lines=100, first_line=7)
+    bed.service.supervise()
+    bed.run.see(recording=False, done=True)
+    bed.service.stop()
+    bed.service.supervise()
+    bed.run.see(done=False)
+    bed.service.start(StartRequest(path=second))
+    now = bed.service.status().recording
+    assert now is not None
+    assert (now.path, now.recorded_lines, now.first_line) == (second, 0, None)
+    bed.run.see(path=str(second), recording=True, done=False, recorded_lines=5, committed_lines=5)
+    bed.service.supervise()
+    assert not [one for one in bed.service.news.after(None) if one.kind == "segment"]
+    bed.service.disarm() if bed.state is State.ARMED else bed.service.shutdown()
+
+
 def test_default_paths_are_free_and_in_the_configured_directory(bed: Bed, tmp_path: Path) -> None:
     seen = set()
     bed.service.arm()

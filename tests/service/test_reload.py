@@ -127,8 +127,13 @@ def test_a_broken_file_changes_nothing_and_is_reported(daemon: Daemon) -> None:
             assert why in sentence(answer)
             assert why in news_of(client)
         daemon.config.unlink()
+        gone = daemon("reload")
+        assert gone.code == 2
+        assert "with which the service was started, does not exist" in sentence(gone)
+        assert "put the file back" in sentence(gone)
+        assert "rig-demo" not in gone.err  # the daemon cannot go on with another rig
         daemon.process.send_signal(signal.SIGHUP)
-        until(lambda: "does not exist" in news_of(client))
+        until(lambda: "reload by SIGHUP" in (news := news_of(client)) and "does not exist" in news)
         assert client.setup().config == before
         assert client.status().state is State.IDLE
     until(lambda: "reload by SIGHUP: nothing was changed: " in daemon.log.read_text())

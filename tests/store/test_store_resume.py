@@ -76,7 +76,7 @@ def test_a_killed_recording_goes_on_in_segments(killed):
     assert {r.attrs["run_id"] for r in (first, *first.segments)} == {"run-1"}
     for start in (1010, 1505, 1710):
         np.testing.assert_array_equal(first.cut(start, 20).lines[0], truth.block("a", start, 20).pixels)
-    with pytest.raises(UsageError, match="5 lines from line 1600 on are not all there"):
+    with pytest.raises(UsageError, match="5 lines from line 1600 on cannot be read in full"):
         first.cut(1600, 5)
     assert all(verify(path).intact for path in (killed, second, third))
 

@@ -62,7 +62,7 @@ def test_gaps_that_cannot_be_read_are_listed_anew_from_the_flags(
     lost = done.tables_lost["gaps"]
     assert done.changed
     assert f"table gaps/{column} cannot be read: the checksum is wrong" in lost
-    assert "1 gaps were listed from the flags, their causes are lost" in lost
+    assert "1 gap was listed from the flags, without the cause" in lost
     again = open_recording(path)
     (gap,) = again.gaps
     assert (gap.arm, gap.first_line, gap.count, gap.cause) == ("b", 1040, 3, "unlisted")
@@ -103,7 +103,8 @@ def test_columns_of_events_that_are_whole_are_kept(
     path = left(tmp_path / "r.zarr", sealed=sealed)
     cut_short(path / "events" / column / "c" / "0")
     lost = recover(path).tables_lost["events"]
-    count = f"{len(kept)} events were kept without it" if kept else "no event was kept"
+    words = "1 event was" if len(kept) == 1 else f"{len(kept)} events were"
+    count = f"{words} kept without it" if kept else "no event was kept"
     assert lost == f"table events/{column} cannot be read: the checksum is wrong; {count}"
     again = open_recording(path)
     *events, recovered, of_table = again.events

@@ -36,6 +36,7 @@ class MemoryWriter:
     ending: tuple[RunCondition, str, dict[str, Any]] | None = None
     closed: bool = False
     broken: tuple[str, ...] = ()
+    error: Exception | None = None
     committed_lines: int = 0
     kept_lines: int = 0
     nearly_full: str | None = None
@@ -76,6 +77,8 @@ class MemoryWriter:
         return np.concatenate([getattr(block, name) for block in self.blocks[arm]])
 
     def _refuse(self, name: str) -> None:
+        if name in self.broken and self.error is not None:
+            raise self.error
         if name in self.broken:
             raise DataError(f"{name}: no space left", possible="0 lines can be read", hint="free space")
 
@@ -306,12 +309,27 @@ def test_what_a_disk_that_failed_did_not_keep_is_not_in_the_books() -> None:
     assert sealed.ledger["b"]["balanced"]
 
 
+def test_two_errors_of_a_disk_are_both_told_unless_they_are_the_same() -> None:
+    def told(first: OSError, second: OSError) -> str:
+        writer = MemoryWriter(broken=("seal",))
+        error, writer.error = (
+            DataError(f"committing: {first.strerror}"),
+            DataError(f"sealing: {second.strerror}"),
+        )
+        error.__cause__, writer.error.__cause__ = first, second
+        return make_session(writer, lines=50).close(error).end_reason
+
+    gone, full = OSError(2, "No such file"), OSError(28, "No space left")
+    assert told(gone, gone) == "write error: committing: No such file; nor could it be sealed"
+    assert told(full, gone) == "write error: committing: No space left; not sealed: sealing: No such file"
+
+
 def test_a_disk_that_does_not_even_seal_leaves_the_recording_as_committed() -> None:
     writer = MemoryWriter(broken=("seal",))
     session = make_session(writer, lines=50)
     feed(session, 50, 50)
     sealed = session.close()
     assert sealed.condition is RunCondition.ABORTED
-    assert sealed.end_reason == "write error: seal: no space left; not sealed: seal: no space left"
+    assert sealed.end_reason == "write error: seal: no space left; nor could it be sealed"
     assert writer.closed
     assert writer.ending is None

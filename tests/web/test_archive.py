@@ -75,6 +75,23 @@ def test_damaged_and_missing_lines_are_shown_as_lost_and_listed(tmp_path: Path) 
     assert listed.tainted_by == ["arm b: 7 lines that arrived damaged", "tag mismatches: 2"]
 
 
+def test_a_recording_of_any_name_is_listed_shown_and_held(tmp_path: Path) -> None:
+    with RecordingWriter.create(tmp_path / "take 3", make_spec()) as writer:
+        fill(writer, 64)
+        writer.commit()
+        archive = Archive(tmp_path)
+        archive.hold("take 3", HoldRequest(first_line=archive.recording("take 3").first_line, lines=4))
+        assert archive.recording("take 3").held
+    (tmp_path / "older").mkdir()
+    (tmp_path / "link").symlink_to(tmp_path / "take 3")
+    assert [one.name for one in archive.recordings()] == ["take 3"]
+    assert archive.recording("take 3").lines > 0
+    assert archive.picture("take 3")
+    for name in ("older", "link", "..", "", ".", "take 3/a"):
+        with pytest.raises(PlaceError):
+            archive.recording(name)
+
+
 def test_a_hold_is_listed_before_the_writer_has_seen_it(tmp_path: Path) -> None:
     """It was looked for in another directory than the one in which it is."""
     with RecordingWriter.create(tmp_path / "run.zarr", make_spec()) as writer:

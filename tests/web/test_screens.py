@@ -53,7 +53,7 @@ class Instrument:
         self.run.see(**changes)
         self.service.supervise()
 
-    def disk(self, *, seconds_to_full: float) -> None:
+    def disk(self, *, seconds_to_full: float, away: str | None = None) -> None:
         """What the disk under the test has left would be told as well."""
         left = DiskStatus(
             directory=Path("/d"),
@@ -64,9 +64,14 @@ class Instrument:
         )
 
         class Disk:
-            status = left
+            status = None if away else left
+            trouble = away
 
             def check(self, *, recording: bool) -> None: ...
+            def came_back(self) -> bool:
+                return False
+
+            def refuse(self, path: Path) -> None: ...
             def close(self) -> None: ...
 
         self.service._disk = Disk()  # type: ignore[assignment]
@@ -135,6 +140,12 @@ def fill_disk(instrument: Instrument) -> None:
     instrument.disk(seconds_to_full=240.0)
 
 
+def lose_directory(instrument: Instrument) -> None:
+    arm(instrument)
+    text = "no recording can begin in /data/runs: its disk is not mounted on /data any more; mount it again"
+    instrument.disk(seconds_to_full=0.0, away=text)
+
+
 def go_silent(instrument: Instrument) -> None:
     arm(instrument)
     instrument.close()
@@ -147,6 +158,7 @@ STATES: dict[str, tuple[Callable[[Instrument], None], str, str, str]] = {
     "lost": (lose, "lost", "lines lost", "246 lines were lost"),
     "faulted": (fail, "fault", "fault", "camera b does not answer"),
     "disk nearly full": (fill_disk, "degraded", "degraded", "the disk is full in 4 min"),
+    "directory away": (lose_directory, "degraded", "degraded", "its disk is not mounted on /data any more"),
     "stale": (go_silent, "", "no contact", "cannot reach the daemon"),
 }
 

@@ -26,6 +26,7 @@ from acquire.sim.leds import LedScene, LedSceneConfig
 from acquire.sim.scenes import build_scene
 from acquire.sim.voxels import truth
 from acquire.store import Recording, open_recording, write_video
+from acquire.text import counted
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -130,7 +131,7 @@ def _solve(method: Method, segment: Segment, journal: StepJournal) -> Reconstruc
             solver=method.solver,
             refuse=False,  # the report shows a poor result rather than none
         )
-        note["detail"] = f"{result.iterations} iterations"
+        note["detail"] = counted(result.iterations, "iteration")
         if result.compiled_s >= REPORTED_S:
             note["detail"] += f", including {result.compiled_s:.1f} s of compilation, needed {how_often()}"
     return result

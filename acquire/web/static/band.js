@@ -1,6 +1,6 @@
 // The band that can be read from three metres: state, colour, duration, what is left, a sentence, lost lines.
 
-import { $, count, duration, make } from "./words.js";
+import { $, count, counted, duration, make } from "./words.js";
 
 const WORDS = { idle: "idle", armed: "armed", recording: "recording", draining: "sealing", faulted: "fault" };
 
@@ -27,7 +27,7 @@ export class Band {
     $("state").textContent = WORDS[status.state];
     $("flag").textContent = unseen ? "lines lost" : document.body.dataset.level === "degraded" ? "degraded" : "";
     $("since").textContent = status.busy ? `${status.busy} …` : `for ${duration(forS)}`;
-    $("sentence").textContent = unseen && !health.lost_lines ? `${count(this.#sticky)} lines were lost in the previous run.` : health.sentence;
+    $("sentence").textContent = unseen && !health.lost_lines ? `${counted(this.#sticky, "line")} ${this.#sticky === 1 ? "was" : "were"} lost in the previous run.` : health.sentence;
     [$("left-label").textContent, $("left").textContent] = left(status);
     $("rig").textContent = status.name;
     document.title = `${WORDS[status.state].toUpperCase()}${unseen ? " – LINES LOST" : ""} · ${status.name}`;
@@ -63,7 +63,7 @@ export class Band {
 /** Return label and amount of what is left of the recording's budget, or else of the disk. */
 function left(status) {
   const now = status.recording;
-  if (now?.budget_lines) return ["left", `${count(Math.max(0, now.budget_lines - now.recorded_lines))} lines`];
-  if (now) return ["recorded", `${count(now.recorded_lines)} lines`];
-  return ["space on the disk", status.disk ? duration(status.disk.seconds_to_full) : "–"];
+  if (now?.budget_lines) return ["left", counted(Math.max(0, now.budget_lines - now.recorded_lines), "line")];
+  if (now) return ["recorded", counted(now.recorded_lines, "line")];
+  return ["space on the disk", status.disk_trouble ? "unusable" : status.disk ? duration(status.disk.seconds_to_full) : "–"];
 }

@@ -1,6 +1,6 @@
 // A coarse video of the latest lines: its frames are repeated until the next glimpse arrives.
 
-import { $ } from "./words.js";
+import { $, counted } from "./words.js";
 
 const FRAME_MS = 80;
 /** A glimpse is reported as late after this time, while the frames of the previous one are still repeated. */
@@ -28,7 +28,7 @@ export class Glimpse {
     const now = performance.now();
     this.#rate = [...this.#rate, now].filter((at) => at > now - 5000);
     this.#taken = now;
-    this.#words = `${header.tile ? `tile ${header.tile}, ` : ""}${header.columns} × ${header.rows} voxels, ${header.frames} frames, ${header.age_s.toFixed(1)} s old, ${(this.#rate.length / 5).toFixed(1)} per second`;
+    this.#words = `${header.tile ? `tile ${header.tile}, ` : ""}${header.columns} × ${header.rows} voxels, ${counted(header.frames, "frame")}, ${header.age_s.toFixed(1)} s old, ${(this.#rate.length / 5).toFixed(1)} per second`;
     $("glimpse-text").textContent = this.#words;
   }
 

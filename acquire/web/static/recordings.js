@@ -2,7 +2,7 @@
 
 import { ask } from "./link.js";
 import { Player } from "./player.js";
-import { $, count, day, duration, fill, make, quantity } from "./words.js";
+import { $, count, counted, day, duration, fill, make, quantity } from "./words.js";
 
 const REFRESH_MS = 3000;
 /** The server lists only the newest (`archive.MOST_LISTED`). */
@@ -35,12 +35,12 @@ export class Recordings {
   #list(recordings) {
     const more = recordings.length < MOST_LISTED ? [] : [make("li", { className: "hint" }, `The newest ${MOST_LISTED} are shown; acquire ls lists all.`)];
     fill($("recording-list"), JSON.stringify([recordings, this.#chosen]), () => recordings.length ? [...recordings.map((one) => {
-      const lost = Object.values(one.lost_lines ?? {}).reduce((sum, n) => sum + n, 0), state = one.error ? "DAMAGED" : one.condition ?? one.state;
+      const lost = Object.values(one.lost_lines ?? {}).reduce((sum, n) => sum + n, 0), state = one.error ? "cannot be read" : one.condition ?? one.state;
       return make("li", {}, make("button", { id: `recording-${one.name}`, "aria-pressed": String(one.name === this.#chosen), onclick: () => this.#choose(one.name) },
-        make("img", { src: one.error ? "" : `/api/recordings/${encodeURIComponent(one.name)}/picture?${one.lines}`, alt: "", loading: "lazy" }),
+        one.error ? make("span", { className: "blank", "aria-hidden": "true" }) : make("img", { src: `/api/recordings/${encodeURIComponent(one.name)}/picture?${one.lines}`, alt: "", loading: "lazy" }),
         make("span", {}, make("b", {}, one.name),
-          make("small", { className: one.error || one.damage || lost || one.tainted_by.length || one.incomplete.length ? "bad" : "" }, `${state}${lost ? `, ${count(lost)} lines lost` : ""}${one.incomplete.length ? ", its lists are incomplete" : ""}${one.held ? ", held" : ""}`),
-          make("small", {}, one.error ?? `${count(one.lines)} lines, ${duration(one.duration_s)}, ${quantity(one.bytes, "B")}`),
+          make("small", { className: one.error || one.damage || lost || one.tainted_by.length || one.incomplete.length ? "bad" : "" }, `${state}${lost ? `, ${counted(lost, "line")} lost` : ""}${one.incomplete.length ? ", its lists are incomplete" : ""}${one.held ? ", held" : ""}`),
+          make("small", {}, one.error ?? `${counted(one.lines, "line")}, ${duration(one.duration_s)}, ${quantity(one.bytes, "B")}`),
           make("small", {}, [one.start_ns ? day(one.start_ns) : "", one.uploaded ? `copied to ${one.uploaded}` : ""].filter(Boolean).join("; ")))));
     }), ...more] : [make("li", {}, "No recordings yet.")]);
   }
@@ -77,7 +77,7 @@ export class Recordings {
   }
 
   #strip(one, first, lines) {
-    const canvas = make("canvas", { role: "img", "aria-label": `${one.event_list.length} events, ${one.gap_list.length} gaps, ${one.hold_list.length} held ranges` }), element = make("div", { className: "strip" }, canvas);
+    const canvas = make("canvas", { role: "img", "aria-label": `${counted(one.event_list.length, "event")}, ${counted(one.gap_list.length, "gap")}, ${counted(one.hold_list.length, "held range")}` }), element = make("div", { className: "strip" }, canvas);
     const draw = () => {
       const width = (canvas.width = element.clientWidth || 600), height = (canvas.height = element.clientHeight || 88), context = canvas.getContext("2d");
       const x = (line) => ((line - one.first_line) / Math.max(1, one.lines)) * width;
@@ -107,7 +107,7 @@ export class Recordings {
 
   #jobs(jobs) {
     fill($("jobs"), JSON.stringify([jobs, this.#operator]), () => jobs.length ? jobs.map((job) => make("li", {},
-      make("b", { className: job.state === "failed" ? "bad" : job.state === "done" ? "good" : "" }, job.state), ` ${job.step ? `${job.kind} ${job.step}` : `${job.kind} of ${job.recording}, ${count(job.lines)} lines from ${count(job.first_line)}`}`, job.text ? make("small", {}, job.text) : null,
+      make("b", { className: job.state === "failed" ? "bad" : job.state === "done" ? "good" : "" }, job.state), ` ${job.step ? `${job.kind} ${job.step}` : `${job.kind} of ${job.recording}, ${counted(job.lines, "line")} from ${count(job.first_line)}`}`, job.text ? make("small", {}, job.text) : null,
       job.state === "running" && job.total ? make("progress", { max: job.total, value: job.done, "aria-label": `Progress of job ${job.id}` }) : null,
       job.result?.endsWith(".npz") ? make("a", { href: `/api/cuts/${encodeURIComponent(job.result)}`, download: job.result }, job.result) : null,
       ["waiting", "running"].includes(job.state) ? make("button", { id: `stop-${job.id}`, disabled: !this.#operator, "aria-label": `Stop job ${job.id}`, onclick: () => ask("DELETE", `jobs/${job.id}`).then(() => this.#refresh(), (error) => this.#fail(error.message)) }, "Stop") : null)) : [make("li", {}, "None.")]);
@@ -115,6 +115,6 @@ export class Recordings {
 
   #videos(videos) {
     fill($("videos"), JSON.stringify(videos), () => videos.length ? videos.map((video) => make("li", {},
-      make("button", { id: `video-${video.name}`, onclick: () => this.#player.open(video.name), disabled: Boolean(video.error) }, video.name), video.error ?? `${count(video.frames)} frames of ${video.columns} × ${video.rows}, ${quantity(video.interval_ns / 1e9, "s")} apart`)) : [make("li", {}, "None yet: choose a recording and reconstruct a stretch.")]);
+      make("button", { id: `video-${video.name}`, onclick: () => this.#player.open(video.name), disabled: Boolean(video.error) }, video.name), video.error ?? `${counted(video.frames, "frame")} of ${video.columns} × ${video.rows}, ${quantity(video.interval_ns / 1e9, "s")} apart`)) : [make("li", {}, "None yet: choose a recording and reconstruct a stretch.")]);
   }
 }

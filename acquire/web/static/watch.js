@@ -2,7 +2,7 @@
 
 import { ask } from "./link.js";
 import { Histogram, SHOWN_S, Waterfall } from "./waterfall.js";
-import { $, clock, count, duration, fill, make, percent, quantity } from "./words.js";
+import { $, clock, count, counted, duration, fill, make, percent, quantity } from "./words.js";
 
 const HOLD_MS = 600;
 const MOST_EVENTS = 60;
@@ -113,11 +113,11 @@ export class Watch {
   #now(status) {
     const past = Object.values(status.arms).map((arm) => arm.ring.history / arm.ring.slots), facts = [];
     const history = this.#setup && past.length ? Math.min(this.#setup.history_s, Math.min(...past) * this.#setup.history_s * (4 / 3)) : null;
-    facts.push(["Recording", status.recording ? `${name(status.recording.path)}, ${count(status.recording.recorded_lines)} lines, ${count(status.recording.committed_lines)} readable` : "–"]);
+    facts.push(["Recording", status.recording ? `${name(status.recording.path)}, ${counted(status.recording.recorded_lines, "line")}, ${count(status.recording.committed_lines)} readable` : "–"]);
     facts.push(["Pre-trigger", history === null ? "–" : `${history.toFixed(1)} s available now`]);
-    facts.push(["Trigger", status.trigger ? `${status.trigger.answers ? "answers" : `SILENT for ${duration(status.trigger.silent_s)}`}, ${count(status.trigger.pulses)} lines` : "–"]);
-    facts.push(["Disk", status.disk ? `${quantity(status.disk.free_bytes, "B")} free, full in ${duration(status.disk.seconds_to_full)}` : "–"]);
-    facts.push(["Last", status.last ? `${name(status.last.path)}, ${count(status.last.lines)} lines, ${status.last.condition ?? "not sealed"}` : "–"]);
+    facts.push(["Trigger", status.trigger ? `${status.trigger.answers ? "answers" : `SILENT for ${duration(status.trigger.silent_s)}`}, ${counted(status.trigger.pulses, "line")}` : "–"]);
+    facts.push(["Disk", status.disk_trouble ? `✗ ${status.disk_trouble}` : status.disk ? `${quantity(status.disk.free_bytes, "B")} free, full in ${duration(status.disk.seconds_to_full)}` : "–"]);
+    facts.push(["Last", status.last ? `${name(status.last.path)}, ${counted(status.last.lines, "line")}, ${status.last.condition ?? "not sealed"}` : "–"]);
     if (status.waiting) facts.push(["Waiting", status.waiting]);
     fill($("now"), JSON.stringify(facts), () => facts.flatMap(([term, text]) => [make("dt", {}, term), make("dd", {}, text)]));
   }

@@ -27,6 +27,9 @@ export function fill(element, key, build) {
 
 export const count = (value) => Number(value).toLocaleString("en").replaceAll(",", "\u202f");
 
+/** "1 line", "3 lines". */
+export const counted = (value, noun) => `${count(value)} ${noun}${Number(value) === 1 ? "" : "s"}`;
+
 export function quantity(value, unit) {
   for (const [factor, prefix] of [[1e12, "T"], [1e9, "G"], [1e6, "M"], [1e3, "k"]])
     if (Math.abs(value) >= factor) return `${Number((value / factor).toPrecision(3))}\u202f${prefix}${unit}`;

@@ -1,0 +1,71 @@
+"""Whether recordings can begin in the configured directory, and if not, why and what to do."""
+
+from __future__ import annotations
+
+import errno
+import os
+from pathlib import Path
+from typing import NamedTuple
+
+from acquire.store.refusals import CURES
+
+_MISSING = "mount its disk, or put the directory back"
+
+
+class Trouble(NamedTuple):
+    """Why nothing can be recorded there, and what helps."""
+
+    text: str
+    hint: str
+
+    def __str__(self) -> str:
+        return f"{self.text}; {self.hint}"
+
+
+def trouble(directory: Path, why: str, hint: str) -> Trouble:
+    return Trouble(f"no recording can begin in {directory}: {why}", hint)
+
+
+def mount_above(directory: Path) -> Path:
+    """Return the point at which the directory's disk is mounted; for one that is missing, its parents'."""
+    path = Path(os.path.realpath(directory))
+    return next(above for above in (path, *path.parents) if above == above.parent or above.is_mount())
+
+
+class Place:
+    """A directory and the mount point of its disk, as they were when the daemon started."""
+
+    def __init__(self, directory: Path) -> None:
+        self._directory = directory
+        self._mount = mount_above(directory)
+
+    def look(self) -> Trouble | None:
+        """Return the trouble with it, or None. May wait for the disk."""
+        directory, mount = self._directory, self._mount
+        # Where a disk was mounted there is a directory without it, too: on the host's own disk, which the
+        # recordings would fill, and would be hidden once the disk is back.
+        if not mount.is_mount():
+            return trouble(directory, f"its disk is not mounted on {mount} any more", "mount it again")
+        # By its attributes: `is_dir` hides why a directory cannot be reached.
+        try:
+            directory.stat()
+        except OSError as error:
+            return unreachable(directory, error)
+        if not directory.is_dir():
+            return trouble(directory, "it is not a directory any more", "move away what is there instead")
+        if os.statvfs(directory).f_flag & os.ST_RDONLY:
+            return trouble(directory, "it is on a disk that is mounted read-only", CURES[errno.EROFS])
+        if not os.access(directory, os.W_OK | os.X_OK):
+            return trouble(directory, "this user may not write to it", f"chown or chmod {directory}")
+        self._mount = mount_above(directory)  # a disk that was mounted since then counts from now on
+        return None
+
+
+def unreachable(directory: Path, error: OSError) -> Trouble:
+    """Return the trouble with a directory that cannot be queried."""
+    if isinstance(error, FileNotFoundError):
+        return trouble(directory, "it is not there", _MISSING)
+    if error.errno in (errno.ENOTDIR, errno.ELOOP):
+        return trouble(directory, "it is not a directory any more", "move away what is there instead")
+    hint = CURES.get(error.errno or 0, "the kernel's log for errors of the disk or its network")
+    return trouble(directory, error.strerror or str(error), hint)
