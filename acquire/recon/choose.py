@@ -257,7 +257,7 @@ def _or_drifting(volume: Trial, rival: float) -> Trial:
     if candidate is None or bench.clock.spent(SEARCH_SHARE):
         return volume
     found = bench.probe(candidate, min(volume.error, rival))
-    return min(volume, _wide_enough(found, max(map(abs, candidate.drift))), key=_error)
+    return min(volume, _along(found, volume, max(map(abs, candidate.drift))), key=_error)
 
 
 def _or_turning(volume: Trial, rival: float) -> Trial:
@@ -270,21 +270,26 @@ def _or_turning(volume: Trial, rival: float) -> Trial:
     for ground in (0.0, GROUND):
         probed = bench.probe(replace(candidate, ground=ground), min(found.error, rival))
         found = min(found, probed, key=_error)
-    if found is not volume and not found.candidate.period_frames:
-        # The rim of a picture whose sides are 1 moves by π turns.
-        found = _wide_enough(found, np.pi * abs(candidate.rotation[0]))
+    if found is volume:
+        return volume
+    # The rim of a picture whose sides are 1 moves by π turns. A cycle has its harmonics.
+    found = _along(found, volume, 0.0 if candidate.period_frames else np.pi * abs(candidate.rotation[0]))
     # A cycle at rest had many rounds to fit its speed, and needs no head start.
-    most = 1.0 if volume.candidate.period_frames else TURNING
+    most = 1.0 if candidate.period_frames else TURNING
     return found if found.error < most * volume.error else volume
 
 
-def _wide_enough(found: Trial, sides: float) -> Trial:
-    """A trial, or one of as many cosines as contents take that move by so many sides, if that is better.
+def _along(found: Trial, volume: Trial, sides: float) -> Trial:
+    """A first trial that follows what moves by so many ``sides``, on a better path and in enough cosines.
 
-    A picture of n′ pixels that moves by v sides turns its finest wave v·n′/2 times, which takes v·n′ cosines.
-    With fewer, a search finds calmer volumes better, and never arrives there.
+    Weights are searched for later: those that suit a wrong path are wrong. A picture of n′ pixels that moves
+    by v sides turns its finest wave v·n′/2 times, which takes v·n′ cosines. With fewer, a search finds calmer
+    volumes better, and never arrives there.
     """
-    bench, finest = found.bench, sides * found.admm.theta.shape[1]
+    bench = found.bench
+    if found.error < volume.error:
+        found = bench.follow_path(found)
+    finest = sides * found.admm.theta.shape[1]
     count = min(next((each for each in COSINES if each >= finest), COSINES[-1]), bench.frames)
     if count <= found.candidate.coefficients or bench.clock.spent(SEARCH_SHARE):
         return found
