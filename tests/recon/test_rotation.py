@@ -19,13 +19,13 @@ COUNT = 36
 TIMES = (np.arange(COUNT) + 0.5) / COUNT - 0.5
 
 
-def turning(seed: int, side: int, rotation: tuple[float, float, float]) -> np.ndarray:
-    """Soft balls (COUNT, side, side) on a wheel that turns about a centre."""
+def turning(seed: int, side: int, rotation: tuple[float, float, float], rise: float = 0.0) -> np.ndarray:
+    """Soft balls (COUNT, side, side) on a wheel that turns about a centre; its speed may rise."""
     rng, (turns, row, column) = np.random.default_rng(seed), rotation
     y, x = np.mgrid[:side, :side] - (side - 1) / 2
     radius, start = side * rng.uniform(0.05, 0.25, 12), rng.uniform(0, 2 * np.pi, 12)
     height = rng.uniform(0.5, 1, 12)
-    angle = start + 2 * np.pi * turns * TIMES[:, None]
+    angle = start + 2 * np.pi * turns * (TIMES + rise * TIMES**2)[:, None]
     down, right = row * side + radius * np.sin(angle), column * side + radius * np.cos(angle)
     far = (y - down[..., None, None]) ** 2 + (x - right[..., None, None]) ** 2
     return np.sum(height[:, None, None] * np.exp(-far / 2 / 1.5**2), axis=1)
@@ -42,6 +42,16 @@ def test_the_turn_is_found_before_a_ground_and_in_noise(
     ground = 3 * gaussian_filter(rng.standard_normal((side, side)), 2)
     video = turning(1, side, rotation) + ground + 0.05 * rng.standard_normal((COUNT, side, side))
     assert find_rotation(video) == pytest.approx(rotation, abs=0.02)
+
+
+@pytest.mark.parametrize("rise", [0.2, -0.4])
+def test_a_speed_that_changes_is_found_and_followed(rise: float) -> None:
+    rotation = (-0.8, 0.1, -0.05)
+    x = turning(4, 33, rotation, rise)
+    assert find_rotation(x) == pytest.approx((*rotation, rise), abs=0.02)
+    assert find_rotation(x, steady=True) == pytest.approx(rotation, abs=0.1)
+    y = Rotation(rotation, COUNT, 33, x, rise).follow(x)
+    assert y.std(axis=0).max() < 0.02 * x.std(axis=0).max()
 
 
 def test_what_does_not_turn_has_no_turn() -> None:
@@ -114,7 +124,7 @@ def test_another_library_makes_the_same_steps_and_another_trial_continues() -> N
 def test_what_turns_is_followed(scene: str, monkeypatch: pytest.MonkeyPatch) -> None:
     recorded = record(scene, 1303, stages=32, lines=200)
     truth = recorded.truth(3, 1)
-    found = reconstruct(recorded.segment, 3, 1)
+    found = reconstruct(recorded.segment, 3, 1, preset="fast")
     assert found.parameters["rotation"]
     cyclic = found.parameters["period_frames"] > 0
     assert cyclic == (scene == "disc")  # whose six sectors are alike
@@ -125,7 +135,7 @@ def test_what_turns_is_followed(scene: str, monkeypatch: pytest.MonkeyPatch) -> 
     turns, *centre = found.parameters["rotation"]
     assert half == pytest.approx((turns if cyclic else turns / 2, *centre), abs=1e-2)
     monkeypatch.setattr("acquire.recon.choose.turning", lambda _: None)
-    before = reconstruct(recorded.segment, 3, 1)
+    before = reconstruct(recorded.segment, 3, 1, preset="fast")
     assert before.parameters["rotation"] == ()
     assert found.quality.prediction < 0.9 * before.quality.prediction
-    assert psnr(found.video[found.trusted], truth) > psnr(before.video[before.trusted], truth) + 2
+    assert psnr(found.video[found.trusted], truth) > psnr(before.video[before.trusted], truth) + 1
