@@ -82,9 +82,10 @@ REPEATS = 0.8
 """Largest error of a cycle, relative to the volume's, the still's and the cosines' at a glance, for which it
 is a candidate: a video that repeats itself claims more than any other. Motion that repeats has 0.4 to 0.7,
 text that scrolls 0.9."""
-TURNING = 0.95
-"""Largest error of a volume that turns, relative to that of one at rest, for which it is preferred: wheels
-have 0.5 to 0.8, and a splash that was taken for something that drifts 0.97."""
+FOLLOWED = 0.95
+"""Largest error of a volume that follows what moves, relative to one at rest after as many iterations, for
+which it goes on: text, bodies that cross the field and wheels have 0.5 to 0.94, and a splash, whose picture
+would be 1.3 dB worse, 0.96."""
 CLOSE, NOT_FAR = 1.1, 2.0
 """Largest error of the cosines, relative to the best trial's, for which they are continued, and for which
 they are if clear patterns were found, or if only a glance was taken."""
@@ -257,7 +258,9 @@ def _or_drifting(volume: Trial, rival: float) -> Trial:
     if candidate is None or bench.clock.spent(SEARCH_SHARE):
         return volume
     found = bench.probe(candidate, min(volume.error, rival))
-    return min(volume, _along(found, volume, max(map(abs, candidate.drift))), key=_error)
+    if found.error > FOLLOWED * volume.error:
+        return volume
+    return _along(found, max(map(abs, candidate.drift)))
 
 
 def _or_turning(volume: Trial, rival: float) -> Trial:
@@ -270,26 +273,24 @@ def _or_turning(volume: Trial, rival: float) -> Trial:
     for ground in (0.0, GROUND):
         probed = bench.probe(replace(candidate, ground=ground), min(found.error, rival))
         found = min(found, probed, key=_error)
-    if found is volume:
+    if candidate.period_frames:
+        # A cycle at rest has had many rounds to fit its speed, and needs no head start.
+        return min(volume, bench.follow_path(found), key=_error) if found is not volume else volume
+    if found.error > FOLLOWED * volume.error:
         return volume
-    # The rim of a picture whose sides are 1 moves by π turns. A cycle has its harmonics.
-    found = _along(found, volume, 0.0 if candidate.period_frames else np.pi * abs(candidate.rotation[0]))
-    # A cycle at rest had many rounds to fit its speed, and needs no head start.
-    most = 1.0 if candidate.period_frames else TURNING
-    return found if found.error < most * volume.error else volume
+    # The rim of a picture whose sides are 1 moves by π turns.
+    return _along(found, np.pi * abs(candidate.rotation[0]))
 
 
-def _along(found: Trial, volume: Trial, sides: float) -> Trial:
-    """A first trial that follows what moves by so many ``sides``, on a better path and in enough cosines.
+def _along(found: Trial, sides: float) -> Trial:
+    """A volume that follows what moves by so many ``sides``, on a better path and in enough cosines.
 
     Weights are searched for later: those that suit a wrong path are wrong. A picture of n′ pixels that moves
     by v sides turns its finest wave v·n′/2 times, which takes v·n′ cosines. With fewer, a search finds calmer
     volumes better, and never arrives there.
     """
-    bench = found.bench
-    if found.error < volume.error:
-        found = bench.follow_path(found)
-    finest = sides * found.admm.theta.shape[1]
+    found = found.bench.follow_path(found)
+    bench, finest = found.bench, sides * found.admm.theta.shape[1]
     count = min(next((each for each in COSINES if each >= finest), COSINES[-1]), bench.frames)
     if count <= found.candidate.coefficients or bench.clock.spent(SEARCH_SHARE):
         return found
