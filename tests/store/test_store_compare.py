@@ -78,7 +78,7 @@ def changed(name, row):
 def test_one_row_that_differs_is_found_in_its_array(stored, tmp_path, name, array):
     (found,) = compare(stored, write(tmp_path / "again.zarr", again=True, change=changed(name, 42)))
     assert (found.array, found.rows, found.row) == (array, 1, 42)
-    assert str(found).startswith(f"{array} differs in 1 rows, first in row 42: ")
+    assert str(found).startswith(f"{array} differs in 1 row, first in row 42: ")
 
 
 def test_a_tick_that_differs_takes_its_time_with_it(stored, tmp_path):

@@ -130,7 +130,7 @@ def test_verify_reports_an_overview_that_contradicts_the_lines(tmp_path):
     recording = record(tmp_path / "r.zarr", 300)
     array = zarr.open_group(recording.path, mode="r+")["overview/b"]
     array[1:3] += 1
-    told = "b: 2 rows of the overview are not the mean of their lines"
+    told = "b: 2 rows of the overview are not the mean of the lines"
     assert verify(recording.path).contradictions == (told,)
     file = recording.path / CHUNKS[0]
     file.write_bytes(file.read_bytes()[:-1])

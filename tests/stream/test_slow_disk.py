@@ -169,7 +169,7 @@ def test_a_disk_that_fails_acknowledges_nothing_more(
         seen, acknowledged = until_done(capture, path)
         assert seen.condition == "ABORTED"
         assert os.strerror(number) in str(seen.end_reason)
-        assert ("not sealed" in str(seen.end_reason)) is wholly
+        assert ("nor could it be sealed" in str(seen.end_reason)) is wholly
         assert acknowledged > 0
         recording = open_recording(path)
         assert recording.lines >= acknowledged

@@ -17,7 +17,7 @@ from fake_run import FakeRun, rig_config
 from served import api
 
 from acquire.client import AsyncClient
-from acquire.daemon import service as service_module
+from acquire.daemon import states
 from acquire.daemon.endpoint import Endpoint
 from acquire.daemon.service import Service
 from acquire.web import live as live_module
@@ -100,7 +100,7 @@ def test_how_long_a_state_lasts_does_not_follow_a_clock_that_is_set(
         running = asyncio.create_task(hub.run())
         client = AsyncClient(socket)
         try:
-            monkeypatch.setattr(service_module, "datetime", Later)
+            monkeypatch.setattr(states, "datetime", Later)
             before_s = time.monotonic()
             await client.arm()
             async with asyncio.timeout(60):
