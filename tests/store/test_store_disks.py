@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import errno
 import fcntl
-import json
 import os
 import signal
 import subprocess
@@ -23,7 +22,6 @@ from acquire.lines import ARMS
 from acquire.store import (
     Circumstances,
     RecordingWriter,
-    Retention,
     RunCondition,
     choose_codec,
     files,
@@ -39,7 +37,6 @@ from acquire.store.array_writer import ArrayWriter
 from acquire.store.delivery import whole_file
 from acquire.store.files import Disk, ShardFile, write_all
 from acquire.store.pages import PAGE, aligned_bytes, is_aligned, open_direct
-from acquire.store.retention import HOLDS, LONGEST_WHY
 from acquire.store.shape import CODECS
 from acquire.store.table import EVENT_ROWS, GAP_ROWS
 
@@ -104,36 +101,6 @@ def test_on_a_full_disk_a_hold_leaves_nothing_and_a_recovery_has_its_reserve(sma
     assert recover(path).lines == lines
     assert open_recording(path).state == "sealed"
     assert verify(path).intact
-
-
-@pytest.mark.needs_mount
-def test_however_many_holds_there_are_the_end_finds_room_on_a_full_disk(tmp_path):
-    """The root, which lists them, had outgrown what is reserved for the end."""
-    place = tmp_path / "disk"
-    place.mkdir()
-    subprocess.run(["mount", "-t", "tmpfs", "-o", "size=64m", "none", str(place)], check=True)
-    path, count, reason = place / "r.zarr", 10_000, "x" * LONGEST_WHY
-    spec = make_spec(reserve_bytes=0, retention=Retention(max_bytes=10**9))
-    try:
-        with RecordingWriter.create(path, spec) as writer:
-            fill(writer, 150)
-            hold(path, 1000, 1, "the first")
-            for lines in range(2, count + 1):
-                text = json.dumps({"first_line": 1000, "count": lines, "why": reason})
-                (path / "a" / "lines" / HOLDS / f"1000-{lines}.json").write_text(text)
-            writer.commit()
-            with contextlib.suppress(OSError), (place / "rest").open("wb", buffering=0) as rest:
-                while rest.write(bytes(4096)):
-                    pass
-            writer.add_event("mark", 0, 1000, "so that there is something to commit")
-            with pytest.raises(DataError, match="No space left on device"):
-                writer.commit()
-            writer.seal(RunCondition.ABORTED, "disk full", {})
-        found = open_recording(path)
-        assert found.state == "sealed"
-        assert sum(why == reason for *_, why in found.attrs["holds"]) == count - 1
-    finally:
-        subprocess.run(["umount", str(place)], check=True)
 
 
 @pytest.mark.needs_mount
