@@ -59,6 +59,7 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from acquire.lines import Segment
+    from acquire.recon.candidates import Candidate
     from acquire.recon.clock import IterationClock
     from acquire.recon.estimates import Estimate, InBand
     from acquire.recon.options import SolveOptions
@@ -142,9 +143,11 @@ def _choose(bench: Workbench, volume: Trial, trials: int) -> Estimate:
     at_a_glance, clear = bench.held_out.relative(errors), has_clear_patterns(cosines)
     tried = _Tried(volume, plain)
     # These are tried even where cosines are ahead: a scene that flickers gains 6.6 to 15 dB by this, a flame
-    # up to 3.5, and what turns by a cycle. Evident lamps need the time for themselves.
+    # up to 3.5, and what moves or turns by a path or a cycle. Evident lamps need the time for themselves.
     lamps = isinstance(cosines.basis, LearnedBasis) and tried.best.error > HOPELESS * at_a_glance
-    if not (clear or lamps):
+    followed = None if clear or lamps else _following(volume, at_a_glance)
+    # What moves as one neither flows nor flickers.
+    if not (clear or lamps or followed):
         tried.smooth = bench.probe(bench.fitting(SMOOTH), min(at_a_glance, tried.best.error))
         # The first cosine is constant, so that this is the video's mean over time.
         picture = (cosines.basis.matrix()[0, 0] * host(cosines.solver.theta[0, ...])).clip(0)
@@ -156,6 +159,7 @@ def _choose(bench: Workbench, volume: Trial, trials: int) -> Estimate:
         rival = min(at_a_glance, tried.best.error)
         cycle = bench.repeat(*repeats, rival)
         tried.cycle = cycle if cycle.error < REPEATS * rival else None
+    tried.followed = followed  # from now on: a cycle at rest competes with what is at rest
     ahead, refined = at_a_glance <= OUTDONE * tried.best.error, None
     if ahead:
         complete_look(given, cosines)
@@ -177,17 +181,19 @@ def _choose(bench: Workbench, volume: Trial, trials: int) -> Estimate:
 @dataclass
 class _Tried:
     """First trials: a volume, a still and, unless patterns are clear, a smooth volume, one of changing
-    brightness (None if the brightness is steady) and a cycle (None if nothing repeats)."""
+    brightness (None if the brightness is steady), a volume that follows what moves as one (None if nothing
+    does) and a cycle (None if nothing repeats)."""
 
     volume: Trial
     plain: Trial
     smooth: Trial | None = None
     bright: Trial | None = None
+    followed: Trial | None = None
     cycle: Trial | None = None
 
     @property
     def best(self) -> Trial:
-        trials = (self.volume, self.plain, self.smooth, self.bright, self.cycle)
+        trials = (self.volume, self.plain, self.smooth, self.bright, self.followed, self.cycle)
         return min((trial for trial in trials if trial is not None), key=_error)
 
 
@@ -210,11 +216,8 @@ def _search(bench: Workbench, tried: _Tried, trials: int, rival: float) -> Trial
     Of candidates that are far from the error of a ``rival``, only the first trials are made.
     """
     plain = still = tried.plain
-    calm = bench.attempt(bench.fitting(CALM), FIRST_ITERATIONS, plain)
+    volume = _best_volume(bench, tried, rival)
     smooth = tried.smooth or bench.attempt(bench.fitting(SMOOTH), FIRST_ITERATIONS)
-    grounded = bench.attempt(bench.fitting(GROUNDED), FIRST_ITERATIONS)
-    volume = _or_drifting(min(tried.volume, calm, grounded, key=_error), rival)
-    volume = _or_turning(min(volume, tried.cycle or volume, key=_error), rival)
     bright = tried.bright
     # To a brightness, a flash in front of a still is the flash of everything.
     flickers = bright is not None and bench.held_out.clearly_less(bright.errors, plain.errors)
@@ -252,34 +255,53 @@ def _search(bench: Workbench, tried: _Tried, trials: int, rival: float) -> Trial
     return moving if moving.error < most * still.error else still
 
 
-def _or_drifting(volume: Trial, rival: float) -> Trial:
-    """The volume, or the same that follows what moves in it at one velocity, if that predicts better."""
-    bench, candidate = volume.bench, drifting(volume)
-    if candidate is None or bench.clock.spent(SEARCH_SHARE):
-        return volume
-    found = bench.probe(candidate, min(volume.error, rival))
-    if found.error > FOLLOWED * volume.error:
-        return volume
-    return _along(found, max(map(abs, candidate.drift)))
+def _best_volume(bench: Workbench, tried: _Tried, rival: float) -> Trial:
+    """The best of volumes at rest, volumes that follow what moves, and cycles, each after a first trial."""
+    cycle = None if tried.cycle is None else _or_turning(tried.cycle, rival)
+    volume = tried.followed or cycle
+    if volume is not None:
+        return min(volume, cycle or volume, key=_error)
+    calm = bench.attempt(bench.fitting(CALM), FIRST_ITERATIONS, tried.plain)
+    grounded = bench.attempt(bench.fitting(GROUNDED), FIRST_ITERATIONS)
+    volume = min(tried.volume, calm, grounded, key=_error)
+    # The motion may show in a better video, though not in the first.
+    return _following(volume, rival) or volume
 
 
-def _or_turning(volume: Trial, rival: float) -> Trial:
-    """The volume or cycle, or the same that follows what turns in it, if that predicts better."""
-    bench, candidate = volume.bench, turning(volume)
-    if candidate is None or bench.clock.spent(SEARCH_SHARE):
-        return volume
-    # With and without a ground from zero: a step from one to the other hardly arrives there.
-    found = volume
+def _following(volume: Trial, rival: float) -> Trial | None:
+    """The volume, following what drifts or turns in it, if that predicts better; None if it does not."""
+    found = None
+    for path in (drifting, turning):
+        candidate = path(volume)
+        if candidate is not None and not volume.bench.clock.spent(SEARCH_SHARE):
+            best = _on_path(volume, candidate, rival)
+            if best.error <= FOLLOWED * volume.error:
+                # The rim of a picture whose sides are 1 moves by π turns.
+                sides = [np.pi * abs(turn) for turn in candidate.rotation[:1]] or map(abs, candidate.drift)
+                volume = found = _along(best, max(sides))
+    return found
+
+
+def _or_turning(cycle: Trial, rival: float) -> Trial:
+    """The cycle, or the same that follows what turns in it, if that predicts better."""
+    candidate = turning(cycle)
+    if candidate is None or cycle.bench.clock.spent(SEARCH_SHARE):
+        return cycle
+    found = _on_path(cycle, candidate, rival)
+    # A cycle at rest has had many rounds to fit its speed, and needs no head start.
+    return found if found is cycle else min(cycle, found.bench.follow_path(found), key=_error)
+
+
+def _on_path(at_rest: Trial, candidate: Candidate, rival: float) -> Trial:
+    """The better one of a trial and of a candidate with and without a ground.
+
+    Each starts from zero: a step from one to the other hardly arrives there.
+    """
+    found = at_rest
     for ground in (0.0, GROUND):
-        probed = bench.probe(replace(candidate, ground=ground), min(found.error, rival))
+        probed = at_rest.bench.probe(replace(candidate, ground=ground), min(found.error, rival))
         found = min(found, probed, key=_error)
-    if candidate.period_frames:
-        # A cycle at rest has had many rounds to fit its speed, and needs no head start.
-        return min(volume, bench.follow_path(found), key=_error) if found is not volume else volume
-    if found.error > FOLLOWED * volume.error:
-        return volume
-    # The rim of a picture whose sides are 1 moves by π turns.
-    return _along(found, np.pi * abs(candidate.rotation[0]))
+    return found
 
 
 def _along(found: Trial, sides: float) -> Trial:
