@@ -302,10 +302,6 @@ class Service:
     def _poll(self) -> CaptureStatus:
         assert self._run is not None
         before, self._seen = self._seen, self._run.capture.poll()
-        if self._seen.waiting and not before.waiting:
-            log.warning("%s", self._seen.waiting)
-        elif before.waiting and not self._seen.waiting:
-            log.warning("over: %s", before.waiting)
         if self._seen.recording and before.recording and before.path != self._seen.path:
             log.warning("%s continues in %s", before.path, self._seen.path)
         self._salvage.add(self._seen.orphans)

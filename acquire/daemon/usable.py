@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import errno
 import os
-from pathlib import Path
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
+from acquire.store.mount import MOUNT_IT, NOT_MOUNTED, mount_above
 from acquire.store.refusals import CURES
+
+if TYPE_CHECKING:
+    from pathlib import Path
 
 _MISSING = "mount its disk, or put the directory back"
 
@@ -26,12 +29,6 @@ def trouble(directory: Path, why: str, hint: str) -> Trouble:
     return Trouble(f"no recording can begin in {directory}: {why}", hint)
 
 
-def mount_above(directory: Path) -> Path:
-    """Return the point at which the directory's disk is mounted; for one that is missing, its parents'."""
-    path = Path(os.path.realpath(directory))
-    return next(above for above in (path, *path.parents) if above == above.parent or above.is_mount())
-
-
 class Place:
     """A directory and the mount point of its disk, as they were when the daemon started."""
 
@@ -45,7 +42,7 @@ class Place:
         # Where a disk was mounted there is a directory without it, too: on the host's own disk, which the
         # recordings would fill, and would be hidden once the disk is back.
         if not mount.is_mount():
-            return trouble(directory, f"its disk is not mounted on {mount} any more", "mount it again")
+            return trouble(directory, NOT_MOUNTED.format(mount), MOUNT_IT)
         # By its attributes: `is_dir` hides why a directory cannot be reached.
         try:
             directory.stat()

@@ -11,7 +11,7 @@
     one array          array_writer → shard       stored_rows → chunks → array_files
     tables             table                      table_reader
     what is written    terms, spec (attributes), layout and shape (metadata), codecs (bytes)
-    where              files (disk), pages, host  source → disk | remote (URLs)
+    where              files (disk), pages, host, mount  source → disk | remote (URLs)
       all or nothing   delivery, refusals
 
 An `Outline` is a recording without its lines: it and everything that it uses need no array library. Names are

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import frozen_disk
 import httpx
+import psutil
 import pytest
 from live_daemon import LINE_RATE_HZ, Daemon
 from waiting import until
@@ -123,8 +124,27 @@ def test_the_host_s_own_disk_is_not_filled_while_another_is_not_mounted(tmp_path
                 assert not [*place.glob("*.zarr")]
                 subprocess.run(["mount", "-o", "loop", tmp_path / "disk.img", disk.path], check=True)
                 check_back(daemon, client, place / "x.zarr", 2.0)
+                check_segment_refused(daemon, client, place / "y.zarr", disk.path)
+                subprocess.run(["mount", "-o", "loop", tmp_path / "disk.img", disk.path], check=True)
+                client.disarm()
+                until(lambda: [one.state for one in client.status().recoveries] == ["recovered"], "recovery")
+                assert open_recording(place / "y.zarr").lines > 300
         finally:
             daemon.close()
+
+
+def check_segment_refused(daemon: Daemon, client: Client, path: Path, mount: Path) -> None:
+    """A recorder is killed while the disk goes: its successor writes nothing to the host's own disk."""
+    client.start(path)
+    until(lambda: (now := client.status().recording) is not None and now.committed_lines > 300, "lines")
+    recorder = psutil.Process(client.status().processes["recorder"])
+    recorder.suspend()
+    subprocess.run(["umount", "--lazy", mount], check=True)
+    recorder.kill()
+    until(lambda: client.status().state is State.FAULTED, "the fault")
+    fault = str(client.status().fault)
+    assert f"no recording can begin in {path.parent}: its disk is not mounted on {mount} any more" in fault
+    assert not [*path.parent.glob("*.zarr")]
 
 
 def test_what_was_left_open_is_recovered_once_its_disk_is_there(tmp_path: Path, place: Path) -> None:
