@@ -18,7 +18,7 @@ export function showHealth(status, health, fail, operator) {
     wide(panel("Checks against fixed thresholds", table(["check", "", "now", "thresholds"], health.checks.map((check) =>
       [check.name, make("span", { className: check.level }, MARKS[check.level]), check.text, check.limit])))),
     panel("What this host sustains", capacity
-      ? make("p", {}, capacity.warning ?? `${quantity(capacity.sustained_hz ?? 0, "lines/s")}; ${quantity(capacity.line_rate_hz, "lines/s")} are configured; the limit is: ${capacity.limit}.`)
+      ? make("p", {}, capacity.warning ?? `${quantity(capacity.sustained_hz ?? 0, "lines/s")}; ${quantity(capacity.line_rate_hz, "lines/s")} are configured; the limit is: ${capacity.limit}.`, capacity.measured ? ` Measured on ${new Date(capacity.measured).toLocaleString("en-GB")}.` : "")
       : make("p", {}, "Not measured since the daemon started."),
     make("button", { id: "measure", disabled: !operator || status.state !== "idle" || Boolean(status.busy), onclick: () => { fail(""); ask("POST", "capacity").catch((error) => fail(error.message)); } }, "Measure now"),
     make("p", { className: "hint" }, "Only while the instrument is idle.")),
