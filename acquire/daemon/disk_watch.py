@@ -6,6 +6,7 @@ ever. So a separate thread makes it, and the status keeps the latest answer.
 
 from __future__ import annotations
 
+import logging
 import shutil
 import threading
 import time
@@ -25,6 +26,9 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from acquire.config import RigConfig
+    from acquire.daemon.journal import Claim
+
+log = logging.getLogger("acquire.daemon")
 
 LOOK_EVERY_S = 2.0
 WINDOW_S = 60.0
@@ -37,14 +41,16 @@ REFUSAL_S = 1.0
 """Time that a start waits for the disk's answer: it may have gone, or come back, since the last one."""
 
 
-def disk_watch(config: RigConfig) -> DiskWatch:
-    """Return the watch of the rig's directory."""
+def disk_watch(config: RigConfig, claim: Claim | None = None) -> DiskWatch:
+    """Return the watch of the rig's directory, which ``claim`` keeps from other daemons."""
     line_bytes = config.pixels * np.dtype(config.cameras.a.dtype).itemsize
     per_s = len(ARMS) * line_bytes * config.passing_hz
     if shares_disk(config.recording.upload_to, config.recording.directory.absolute()):
         per_s *= 2  # the copies fill it as well
     directory = config.recording.directory.absolute()
-    return DiskWatch(directory, config.recording.reserve_bytes, per_s, look=Place(directory).look)
+    place = Place(directory, claim)
+    reserve_bytes = config.recording.reserve_bytes
+    return DiskWatch(directory, reserve_bytes, per_s, look=place.look, take_other=place.take_other)
 
 
 class DiskWatch:
@@ -55,6 +61,7 @@ class DiskWatch:
     directory : directory of recordings for which no path is given
     reserve_bytes : bytes of its disk that recordings leave free
     expected_bytes_per_s : uncompressed rate of the cameras, and of the copies on the same disk
+    look, take_other : see `Place`
     """
 
     def __init__(
@@ -65,12 +72,15 @@ class DiskWatch:
         free_bytes: Callable[[Path], int] = lambda path: shutil.disk_usage(path).free,
         now_s: Callable[[], float] = time.monotonic,
         look: Callable[[], Trouble | None] = lambda: None,
+        take_other: Callable[[], bool] = lambda: False,
     ) -> None:
         self._directory = directory
         self._reserve_bytes = reserve_bytes
         self._expected = expected_bytes_per_s
         self._free_bytes = free_bytes
         self._look = look
+        self._take_other = take_other
+        self._is_other = False
         self._trouble: Trouble | None = None
         self._was_away = False
         self._now_s = now_s
@@ -114,6 +124,17 @@ class DiskWatch:
         self._was_away = self.trouble is not None
         return back
 
+    def other(self) -> str:
+        """Log and return a sentence if the directory is another one than before, once each time; else ""."""
+        with self._changing:
+            is_other, self._is_other = self._is_other, False
+        if not is_other:
+            return ""
+        anew = f"{self._directory} is another directory than before, or its disk was mounted anew"
+        text = f"{anew}: recordings begin in what is there now"
+        log.warning("%s", text)
+        return text
+
     def _begin(self) -> None:
         self._asked_s = self._now_s()
         self._thread = threading.Thread(target=self._ask, name="disk-watch", daemon=True)
@@ -126,8 +147,12 @@ class DiskWatch:
             free = 0 if found else self._free_bytes(self._directory)
         except OSError as error:
             found = unreachable(self._directory, error)
+        is_other = self._take_other()
         with self._changing:
             self._trouble = found
+            if is_other:
+                self._is_other = True
+                self._looks.clear()  # of another disk
             if found is not None:
                 self._looks.clear()  # another disk may come back
                 return

@@ -148,7 +148,7 @@ def held_check(status: Status) -> HealthCheck | None:
     now = status.recording
     if now is None:
         return None
-    text = f"{now.path.name} is within its limit"
+    text = "held lines exceed no limit"
     if now.beyond_bytes:
         size = f"{now.beyond_bytes / 1e6:.0f} MB" if now.beyond_bytes >= 1e6 else f"{now.beyond_bytes} B"
         text = f"{now.path.name} takes {size} more than recording.retention.max_gb allows: lines are held"

@@ -30,32 +30,74 @@ def journal_path(directory: Path, name: str, what: str) -> Path:
     return directory / f".{what}-{name}.json"
 
 
+class Claim:
+    """The right of one daemon to the journals of the rig ``name`` in ``directory``: a lock file there.
+
+    One thread at a time.
+    """
+
+    def __init__(self, directory: Path, name: str) -> None:
+        self._directory = directory
+        self._name = name
+        self._path = directory / f".recordings-{name}.lock"
+        self._lock: LockFile | None = None
+        self._identity: tuple[int, int] | None = None
+
+    def take(self) -> bool:
+        """Lock the directory, unless its lock is held; return whether another directory was locked before.
+
+        Raises StateError if another daemon has the lock, UsageError if something else has its name, and
+        OSError for a directory that cannot be locked.
+        """
+        if self._lock is not None and self._lock.is_there:
+            return False
+        try:
+            found = self._directory.stat()
+            # Whoever may write to the directory may follow this daemon.
+            lock = LockFile(self._path, found.st_mode & 0o666)
+            with contextlib.ExitStack() as undo:
+                undo.callback(lock.close)
+                self._lock_it(lock)
+                undo.pop_all()
+        except OSError as error:
+            if os.path.lexists(self._path) and error.errno not in NO_LOCKS:
+                text = f"{self._path}, which keeps two daemons of one rig apart: {error.strerror}"
+                raise UsageError(text, hint=_OTHERWISE) from error
+            raise
+        self.close()
+        before, self._identity = self._identity, (found.st_dev, found.st_ino)
+        self._lock = lock
+        return before not in (None, self._identity)
+
+    def _lock_it(self, lock: LockFile) -> None:
+        try:
+            lock.take()
+        except BlockingIOError:
+            who = f"another daemon (process {lock.owner}) of a rig named {self._name}"
+            raise StateError(f"{who} records into {self._directory}", hint=_OTHERWISE) from None
+
+    def close(self) -> None:
+        """Release the lock. Idempotent."""
+        if self._lock is not None:
+            self._lock.close()
+            self._lock = None
+
+
 @contextlib.contextmanager
-def only_user(directory: Path, name: str) -> Iterator[None]:
+def only_user(directory: Path, name: str) -> Iterator[Claim]:
     """Keep the journals of the rig ``name`` in ``directory`` from every other daemon.
 
     Raises StateError if one uses them: each would overwrite the other's lists. A directory that cannot be
     locked is logged.
     """
-    path = directory / f".recordings-{name}.lock"
-    with contextlib.ExitStack() as stack:
+    with contextlib.closing(Claim(directory, name)) as claim:
         try:
-            # Whoever may write to the directory may follow this daemon.
-            lock = LockFile(path, directory.stat().st_mode & 0o666)
-            stack.callback(lock.close)
-            lock.take()
-        except BlockingIOError:
-            raise StateError(
-                f"another daemon (process {lock.owner}) of a rig named {name} records into {directory}",
-                hint=_OTHERWISE,
-            ) from None
+            claim.take()
         except OSError as error:
-            if os.path.lexists(path) and error.errno not in NO_LOCKS:
-                raise UsageError(
-                    f"{path}, which keeps two daemons of one rig apart: {error.strerror}", hint=_OTHERWISE
-                ) from error
-            log.warning("a second daemon of this rig would not be noticed: %s: %s", path, error.strerror)
-        yield
+            log.warning(
+                "a second daemon of this rig would not be noticed in %s: %s", directory, error.strerror
+            )
+        yield claim
 
 
 class Journal:

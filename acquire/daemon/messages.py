@@ -283,6 +283,7 @@ class CapacityStatus(Message):
     codec: Text | None = Field(default=None, description="measured codec; chosen if the rig has auto")
     limit: Text | None = Field(default=None, description="the lowest of the limits")
     limits_hz: dict[str, float] = Field(default={}, description="ring, codec, recorder, processors")
+    measured: datetime | None = Field(default=None, description="when")
     warning: Text | None = None
 
 

@@ -21,6 +21,7 @@ from typing import TYPE_CHECKING, Any, cast, get_args
 from acquire.daemon.facts import Level, News, NewsKind
 from acquire.daemon.health import disk_check, held_check
 from acquire.daemon.states import State
+from acquire.stream.lifecycle import MEANINGS, Stage
 from acquire.text import counted
 
 if TYPE_CHECKING:
@@ -145,12 +146,7 @@ class Changes:
         new = [one for one in status.troubles if one.times > known.get(one.text, 0)]
         troubles = [_fact("trouble", one.text, "error") for one in new]
         found += _directory(before, status) + self._disk_level(status) + _held(before, status) + troubles
-        # Only the beginning and the end of a wait are news: its text changes every second.
-        waited = bool(before and before.waiting)
-        if status.waiting and not waited:
-            found.append(_fact("waiting", status.waiting, "warning"))
-        elif waited and not status.waiting:
-            found.append(_fact("waiting", "the wait is over"))
+        found += _waiting(before, status)
         return found + _recoveries(before, status) + _uploads(before, status)
 
     def _disk_level(self, status: Status) -> list[dict[str, Any]]:
@@ -178,6 +174,20 @@ def _directory(before: Status | None, after: Status) -> list[dict[str, Any]]:
     text = now or "recordings can begin in the configured directory again"
     log.log(logging.ERROR if now else logging.INFO, "%s", text)
     return [_fact("disk", text, "error" if now else "info")]
+
+
+def _waiting(before: Status | None, after: Status) -> list[dict[str, Any]]:
+    """Report when a wait begins and ends, and another reason why a recording does not continue."""
+    was, now = (before.waiting if before else None) or "", after.waiting or ""
+    if was and not now:
+        log.warning("over: %s", was)
+        return [_fact("waiting", "the wait is over")]
+    # Not every change: the text of other waits changes every second.
+    paused = MEANINGS[Stage.PAUSED]
+    if not now or (was and (was == now or not now.startswith(paused) or not was.startswith(paused))):
+        return []
+    log.warning("%s", now)
+    return [_fact("waiting", now, "warning")]
 
 
 def _held(before: Status | None, after: Status) -> list[dict[str, Any]]:

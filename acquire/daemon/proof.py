@@ -10,6 +10,7 @@ from __future__ import annotations
 import logging
 import os
 import time
+from datetime import UTC, datetime
 from typing import TYPE_CHECKING
 
 from acquire.capacity.load import Load
@@ -44,6 +45,7 @@ class Proof:
         self._directory = config.recording.directory.absolute()
         self._chosen: tuple[float, CodecChoice] | None = None
         self._measured: tuple[float, Parts] | None = None
+        self._at: datetime | None = None
 
     def choose(self, config: RigConfig) -> CodecChoice:
         """Return the measured codec for the rig, kept for some minutes. Raises as `choose_for` does."""
@@ -90,6 +92,7 @@ class Proof:
             sustained_hz=round(parts.line_rate_hz),
             limit=parts.limit,
             limits_hz={name: round(rate) for name, rate in parts.limits.items()},
+            measured=self._at,
             warning=warning if tight else None,
         )
 
@@ -99,6 +102,7 @@ class Proof:
             return self._measured[1]
         progress("measuring what this host sustains")
         auto = self._config.recording.codec == "auto"
+        self._at = datetime.now(UTC)
         load = Load.of(self._config, self.choose(self._config).codec if auto else None)
         best = measure_parts(load, self._directory)
         for attempt in range(2, TRIES + 1):

@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING, TypeVar
 from acquire.daemon.beginning import begin
 from acquire.daemon.connections import ApiServer, raise_descriptor_limit
 from acquire.daemon.control import build_app
+from acquire.daemon.disk_watch import disk_watch
 from acquire.daemon.ending import END_S, LastResort, leave
 from acquire.daemon.endpoint import Endpoint
 from acquire.daemon.hooks import Hooks
@@ -74,7 +75,7 @@ def serve(config: RigConfig, origin: str = "", reread: Callable[[], RigConfig] |
     directory = config.recording.directory.absolute()
     with (
         contextlib.closing(Endpoint(config.control.socket.absolute())) as endpoint,
-        only_user(directory, config.name),
+        only_user(directory, config.name) as claim,
         Rig(config) as rig,
     ):
         # First: it imports modules while the rest begins, so that the first `arm` need not wait for it.
@@ -92,7 +93,8 @@ def serve(config: RigConfig, origin: str = "", reread: Callable[[], RigConfig] |
             check_rig(config)
             return Run(config, rig, proof.choose)
 
-        service = Service(config, open_run, proof, salvage=salvage, uploads=uploads, troubles=troubles)
+        disk = disk_watch(config, claim)
+        service = Service(config, open_run, proof, salvage, uploads, troubles, disk)
         service.origin = origin
         page, hooks = Page(endpoint.path), Hooks(config.hooks, service.news, config.name)
         reloading = None if reread is None else Reloading(reread, service, hooks)

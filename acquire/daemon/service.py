@@ -35,6 +35,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
     from acquire.config import RigConfig
+    from acquire.daemon.disk_watch import DiskWatch
     from acquire.daemon.messages import CapacityStatus, RecoveryStatus, StartRequest
     from acquire.daemon.needs import OpenRun, Prove, ServiceRun
     from acquire.stream.ring import RingShape
@@ -60,6 +61,7 @@ class Service:
         salvage: Salvage | None = None,
         uploads: Uploads | None = None,
         troubles: Troubles | None = None,
+        disk: DiskWatch | None = None,
     ) -> None:
         self.config = config
         self.origin = ""
@@ -78,7 +80,7 @@ class Service:
         self._run: ServiceRun | None = None
         self._seen = CaptureStatus()
         self._rates = Rates()
-        self._disk = disk_watch(config)
+        self._disk = disk or disk_watch(config)
         self._order = StandingOrder(config)
         self._take: Take | None = None
         self._last: LastRecording | None = None
@@ -241,7 +243,9 @@ class Service:
 
     def _check_disk(self) -> None:
         self._disk.check(recording=self._now.state is State.RECORDING)
-        if self._disk.came_back():
+        if other := self._disk.other():
+            self.news.add("disk", other, level="warning")
+        if self._disk.came_back() or other:
             self._salvage.search()  # it may have brought recordings that were left open
 
     def shutdown(self) -> None:
@@ -302,10 +306,6 @@ class Service:
     def _poll(self) -> CaptureStatus:
         assert self._run is not None
         before, self._seen = self._seen, self._run.capture.poll()
-        if self._seen.waiting and not before.waiting:
-            log.warning("%s", self._seen.waiting)
-        elif before.waiting and not self._seen.waiting:
-            log.warning("over: %s", before.waiting)
         if self._seen.recording and before.recording and before.path != self._seen.path:
             log.warning("%s continues in %s", before.path, self._seen.path)
         self._salvage.add(self._seen.orphans)

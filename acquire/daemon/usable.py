@@ -4,10 +4,16 @@ from __future__ import annotations
 
 import errno
 import os
-from pathlib import Path
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
+from acquire.errors import StateError, UsageError
+from acquire.store.mount import MOUNT_IT, NOT_MOUNTED, mount_above
 from acquire.store.refusals import CURES
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from acquire.daemon.journal import Claim
 
 _MISSING = "mount its disk, or put the directory back"
 
@@ -26,18 +32,22 @@ def trouble(directory: Path, why: str, hint: str) -> Trouble:
     return Trouble(f"no recording can begin in {directory}: {why}", hint)
 
 
-def mount_above(directory: Path) -> Path:
-    """Return the point at which the directory's disk is mounted; for one that is missing, its parents'."""
-    path = Path(os.path.realpath(directory))
-    return next(above for above in (path, *path.parents) if above == above.parent or above.is_mount())
-
-
 class Place:
-    """A directory and the mount point of its disk, as they were when the daemon started."""
+    """A directory and the mount point of its disk, as they were when the daemon started.
 
-    def __init__(self, directory: Path) -> None:
+    ``claim``: the lock that keeps other daemons from it.
+    """
+
+    def __init__(self, directory: Path, claim: Claim | None = None) -> None:
         self._directory = directory
+        self._claim = claim
         self._mount = mount_above(directory)
+        self._is_other = False
+
+    def take_other(self) -> bool:
+        """Return whether another directory was found in its place since the last call."""
+        is_other, self._is_other = self._is_other, False
+        return is_other
 
     def look(self) -> Trouble | None:
         """Return the trouble with it, or None. May wait for the disk."""
@@ -45,7 +55,7 @@ class Place:
         # Where a disk was mounted there is a directory without it, too: on the host's own disk, which the
         # recordings would fill, and would be hidden once the disk is back.
         if not mount.is_mount():
-            return trouble(directory, f"its disk is not mounted on {mount} any more", "mount it again")
+            return trouble(directory, NOT_MOUNTED.format(mount), MOUNT_IT)
         # By its attributes: `is_dir` hides why a directory cannot be reached.
         try:
             directory.stat()
@@ -58,6 +68,18 @@ class Place:
         if not os.access(directory, os.W_OK | os.X_OK):
             return trouble(directory, "this user may not write to it", f"chown or chmod {directory}")
         self._mount = mount_above(directory)  # a disk that was mounted since then counts from now on
+        return self._lock()
+
+    def _lock(self) -> Trouble | None:
+        """Lock the directory again if it is another one, or its lock was removed."""
+        if self._claim is None:
+            return None
+        try:
+            self._is_other = self._claim.take() or self._is_other
+        except (StateError, UsageError) as error:
+            return trouble(self._directory, error.message, error.hint or "")
+        except OSError:
+            return None  # a directory without locks: reported when the daemon started
         return None
 
 

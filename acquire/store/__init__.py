@@ -4,14 +4,14 @@
 
     whole recordings   writer                     reader, listing     verification recovery mirroring  video
       with             retention room resume      outline suspect     scan         mend     place
-      kept from loss   removal, links             opening attributes  compare      rebuild
+      kept from loss   removal, holds, links      opening attributes  compare      rebuild
       seen at once     overview                   extent shortfall
     videos             video_writer, mosaic_writer (tiles), video_layout (metadata)
     one arm            arm_writer                 camera_stream, present
     one array          array_writer → shard       stored_rows → chunks → array_files
     tables             table                      table_reader
     what is written    terms, spec (attributes), layout and shape (metadata), codecs (bytes)
-    where              files (disk), pages, host  source → disk | remote (URLs)
+    where              files, pages, host, mount  source → disk | remote (URLs)
       all or nothing   delivery, refusals
 
 An `Outline` is a recording without its lines: it and everything that it uses need no array library. Names are
@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from acquire.store.camera_stream import CameraStream
     from acquire.store.codecs import CodecChoice, choose_codec
     from acquire.store.files import measure_disk
+    from acquire.store.holds import Hold
     from acquire.store.layout import FORMAT, READABLE
     from acquire.store.mirroring import Mirrored, mirror
     from acquire.store.mosaic_writer import MosaicWriter
@@ -37,7 +38,7 @@ if TYPE_CHECKING:
     from acquire.store.reader import Recording, open_recording
     from acquire.store.recovery import Circumstances, Recovery, recover
     from acquire.store.resume import next_segment
-    from acquire.store.retention import Hold, hold
+    from acquire.store.retention import hold
     from acquire.store.shape import Codec
     from acquire.store.spec import RecordingSpec, RunCondition
     from acquire.store.suspect import Suspect, suspect_lines, taint_words
@@ -99,7 +100,7 @@ _HOMES = {
     "Event": "table_reader",
     "FORMAT": "layout",
     "Gap": "table_reader",
-    "Hold": "retention",
+    "Hold": "holds",
     "Mirrored": "mirroring",
     "MosaicWriter": "mosaic_writer",
     "Outline": "outline",

@@ -19,17 +19,14 @@ from typing import TYPE_CHECKING, Any
 from zlib import crc32
 
 from acquire.errors import DataError, UsageError
-from acquire.lines import ARMS
-from acquire.reading import read_object
 from acquire.store.files import DISK, Publisher
-from acquire.store.layout import PARSE_ERRORS
+from acquire.store.holds import Hold, HoldFiles, directory_of_holds
 from acquire.store.links import refuse_link
 from acquire.store.reader import open_recording
 from acquire.store.refusals import refusal
 from acquire.store.remote import url_below
 from acquire.store.removal import Dropped, remove, shard_files
 from acquire.store.terms import ALL_LINES
-from acquire.text import counted
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -39,25 +36,8 @@ if TYPE_CHECKING:
 
 _NOT_COPIED = "not copied yet"
 
-HOLDS = ".holds"
-"""Directory of the files of `hold`, placed where no Zarr reader lists names."""
-
-
 LONGEST_WHY = 200
 """Longest reason for a hold, in characters: the recording's root lists them all."""
-
-
-@dataclass(frozen=True, slots=True)
-class Hold:
-    """Lines that must not be deleted, and why."""
-
-    first_line: int
-    count: int
-    why: str = ""
-
-    @property
-    def lines(self) -> range:
-        return range(self.first_line, self.first_line + self.count)
 
 
 def hold(path: Path, first_line: int, count: int, why: str = "", disk: Disk = DISK) -> Hold:
@@ -83,7 +63,7 @@ def hold(path: Path, first_line: int, count: int, why: str = "", disk: Disk = DI
             possible=f"lines from {recording.first_line} on",
         )
     held = Hold(first_line, count, why)
-    directory = _holds(path)
+    directory = directory_of_holds(path)
     refuse_link(path, directory)
     text = json.dumps({"first_line": first_line, "count": count, "why": why}).encode()
     try:
@@ -112,38 +92,18 @@ def keep_from(path: Path, line: int, url: str, disk: Disk = DISK) -> None:
     A later call for the same URL replaces an earlier one.
     """
     text = json.dumps({"first_line": line, "count": ALL_LINES, "why": _NOT_COPIED}).encode()
-    refuse_link(path, _holds(path))
+    refuse_link(path, directory_of_holds(path))
     try:
-        _make(_holds(path), disk)
+        _make(directory_of_holds(path), disk)
         # A scratch file of its own, beside that of `hold`: the two are different processes.
-        Publisher(_holds(path) / ".copy", disk).replace(_copy_hold(path, url), text, durable=True)
+        Publisher(directory_of_holds(path) / ".copy", disk).replace(_copy_hold(path, url), text, durable=True)
     except OSError as error:
         raise refusal(f"{path}: lines from {line} on", error, "held") from error
 
 
-def holds_of(path: Path) -> list[Hold]:
-    """Return the holds of a recording that is being written.
-
-    A file that cannot be parsed may stand for any lines: it holds all of them until it is removed.
-    """
-    found = []
-    for file in sorted(_holds(path).glob("[0-9]*.json")):
-        try:
-            facts = read_object(file, follow=False)
-            held = Hold(int(facts["first_line"]), int(facts["count"]), str(facts["why"]))
-            if min(held.first_line, held.count) < 0:  # listed in the root, it would make that invalid
-                raise ValueError(f"it is for {counted(held.count, 'line')} from line {held.first_line}")
-            found.append(held)
-        except FileNotFoundError:
-            continue  # replaced by a wider one, or released, in the meantime
-        except (*PARSE_ERRORS, OSError) as error:
-            found.append(Hold(0, ALL_LINES, f"{file.name} is not a valid hold, remove it: {error}"))
-    return found
-
-
 def release(path: Path, disk: Disk = DISK) -> None:
     """Remove all holds of a sealed recording: nothing of it is deleted any more."""
-    disk.remove_tree(_holds(path))
+    disk.remove_tree(directory_of_holds(path))
 
 
 @dataclass(slots=True)
@@ -170,6 +130,10 @@ class Keeper:
     """Bytes above the policy's limit that remain because lines are held."""
     odd: set[int] = field(default_factory=set)
     """Shards that have become links: they are not deleted, and count as kept."""
+    _files: HoldFiles = field(init=False)
+
+    def __post_init__(self) -> None:
+        self._files = HoldFiles(self.path)
 
     def note(self, kind: str, line: int) -> None:
         """Hold the lines around an event at ``line``, if the policy asks for it."""
@@ -249,7 +213,7 @@ class Keeper:
 
     def _marks(self) -> list[Hold]:
         """Return the holds by `hold`, and one for all lines if a copy is configured and has not begun."""
-        marks = holds_of(self.path)
+        marks = self._files.read()
         target = self.policy.copied_to
         if target is not None and not _copy_hold(self.path, url_below(target, self.path)).exists():
             marks.append(Hold(self.first_line, ALL_LINES, _NOT_COPIED))
@@ -269,10 +233,6 @@ def shard_bytes(path: Path, shard: int) -> int:
     return sum(file.stat().st_size for file in shard_files(path, shard))
 
 
-def _holds(path: Path) -> Path:
-    return path / ARMS[0] / "lines" / HOLDS
-
-
 def _make(directory: Path, disk: Disk) -> None:
     # Without those above: of a recording that was moved they would be a new one that holds nothing.
     with suppress(FileExistsError):
@@ -282,7 +242,7 @@ def _make(directory: Path, disk: Disk) -> None:
 def _copy_hold(path: Path, url: str) -> Path:
     """Return the path of the hold for the lines that a copy has not reached yet."""
     # One for each URL: a copy to one place must not free lines that another has not got yet.
-    return _holds(path) / f"0-copy-{crc32(url.encode()):08x}.json"
+    return directory_of_holds(path) / f"0-copy-{crc32(url.encode()):08x}.json"
 
 
 def _with(stretches: list[range], number: int) -> list[range]:

@@ -26,6 +26,7 @@ from acquire.store import layout
 from acquire.store.arm_writer import ArmWriter
 from acquire.store.codecs import EncodeOnce
 from acquire.store.files import DISK, SCRATCH, Publisher, check_new_path, lock
+from acquire.store.mount import mount_above
 from acquire.store.overview import PassingOverview, withdraw_overview, write_overview
 from acquire.store.pages import keep_freed_memory
 from acquire.store.rebuild import write_copy
@@ -77,6 +78,7 @@ class RecordingWriter:
         """Use `create`."""
         self.path = path
         self.spec = spec
+        self.mount = mount_above(path)
         self._disk = disk
         self._lock = -1
         threads = 0 if spec.codec == "none" else spec.encoders

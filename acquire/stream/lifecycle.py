@@ -326,7 +326,7 @@ class Lifecycle:
         """Return the further segment to be tried now, or None."""
         if self.stage is not Stage.PAUSED or self._begin is None or not self.resumption.is_due(now_s):
             return None
-        self._begin = once_more(self._begin)
+        self._begin = once_more(self._begin, self.resumption.why)
         return self._begin
 
     def on_line(self, line: int) -> bool:

@@ -47,6 +47,7 @@ class Begin:
     lines : the recording's budget; None: until it is ended by `End`
     window : lines around an event; by default from the next line that both arms can give
     end_line : the recording does not go past this line, wherever it begins
+    mount : for a further segment, where the disk of the one before is mounted
     """
 
     path: Path
@@ -54,6 +55,7 @@ class Begin:
     lines: int | None = None
     window: Window = NOW
     end_line: int | None = None
+    mount: Path | None = None
 
     @property
     def budget_lines(self) -> int | None:
@@ -94,10 +96,14 @@ class Extend:
 
 @dataclass(frozen=True, slots=True)
 class Began:
-    """The recording exists; ``end_line``: where it ends without being stopped, if it does."""
+    """The recording exists, on the disk that is mounted on ``mount``.
+
+    ``end_line``: where it ends without being stopped, if it does.
+    """
 
     first_line: int
     end_line: int | None = None
+    mount: Path | None = None
 
 
 @dataclass(frozen=True, slots=True)

@@ -7,13 +7,15 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 from acquire.errors import StoreError
+from acquire.store import RecordingWriter
+from acquire.store.mount import refuse_unmounted
 from acquire.store.suspect import CODE_EVENTS, DOUBTFUL
 from acquire.stream.messages import Note
 
 if TYPE_CHECKING:
     from concurrent.futures import Future
 
-    from acquire.store import RecordingWriter
+    from acquire.store.files import Disk
     from acquire.stream.messages import Begin
     from acquire.stream.window import Span
 
@@ -38,6 +40,12 @@ class Opening:
         if self.span is not None:
             return None if self.span.end_line is None else self.span.end_line - first_line
         return self.begin.lines if self.begin.end_line is None else self.begin.end_line - first_line
+
+
+def prepare(begin: Begin, disk: Disk) -> RecordingWriter:
+    """Do everything that takes time; a further segment needs the disk on which the one before was begun."""
+    refuse_unmounted(begin.path, begin.mount)
+    return RecordingWriter.prepare(begin.path, begin.spec, disk)
 
 
 class Notes:

@@ -32,7 +32,7 @@ from acquire.stream.external_counts import RECORDER, ExternalCounts
 from acquire.stream.kept import Kept
 from acquire.stream.losses import Cause
 from acquire.stream.messages import Began, Begin, Cancel, End, Extend, Interrupt, Note, Refused, RunStarted
-from acquire.stream.opening import Notes, Opening, is_verdict, not_created
+from acquire.stream.opening import Notes, Opening, is_verdict, not_created, prepare
 from acquire.stream.recorder_states import BUSY, STATES, TABLE, RecorderEvent, RecorderState, after
 from acquire.stream.session import OPEN_END, Session
 from acquire.stream.stalls import HELD_UP_S, ArmView, Backlog, DiskWaits, HoldUps, find_stall
@@ -220,9 +220,7 @@ class Recorder:
             return
         # On a busy disk, directories, locks and reserved space can take seconds, during which the rings must
         # be emptied.
-        writer = self._disk.submit(
-            self._waits.elsewhere, RecordingWriter.prepare, begin.path, begin.spec, self._plan.disk
-        )
+        writer = self._disk.submit(self._waits.elsewhere, prepare, begin, self._plan.disk)
         self._opening = Opening(begin, lines, writer)
         self._go(RecorderEvent.BEGIN)
 
@@ -324,7 +322,7 @@ class Recorder:
         # Counters first: the receiver of Began must not find those of the recording before.
         self._publish(self._session)
         end_line = self._session.end_line
-        self._mailbox.post(Began(first_line, None if end_line == OPEN_END else end_line))
+        self._mailbox.post(Began(first_line, None if end_line == OPEN_END else end_line, writer.mount))
         if self._trouble is not None:
             self._interrupt(*self._trouble)
 

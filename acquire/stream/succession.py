@@ -40,6 +40,7 @@ _SHORT_S = 60.0
 """A segment that lasts for less shows that the disk is still in trouble."""
 _LONGEST_WAIT_S = 60.0
 """Upper limit on the wait before an attempt, which doubles as long as attempts fail."""
+_THEN = "; and then "
 READY_S = 120.0
 """How long a successor may take to become ready."""
 
@@ -158,7 +159,8 @@ def continuation(begin: Begin, began: Began, committed_lines: int, why: str) -> 
     # Writing the list of segments into the first recording would delay this one: recovery does it later.
     follows = Continuation(first, number, at, readout_ns(spec, at), cause, listed=False)
     path = free_name(begin.path.with_name(first))
-    return replace(begin, path=path, spec=replace(spec, continues=follows), lines=None, window=window)
+    spec = replace(spec, continues=follows)
+    return replace(begin, path=path, spec=spec, lines=None, window=window, mount=began.mount)
 
 
 def resumed(begin: Begin, began: Began, end_line: int, why: str) -> Begin | None:
@@ -173,14 +175,17 @@ def resumed(begin: Begin, began: Began, end_line: int, why: str) -> Begin | None
     follows = Continuation(first, number, end_line, readout_ns(spec, end_line), why)
     window = Window(kind="resumed", text=f"continues from {begin.path.name}: {why}")
     path = free_name(begin.path.with_name(first))
-    spec = replace(spec, continues=follows)
-    return replace(begin, path=path, spec=spec, lines=None, window=window, end_line=began.end_line)
+    following = replace(begin, path=path, spec=replace(spec, continues=follows), lines=None, window=window)
+    return replace(following, end_line=began.end_line, mount=began.mount)
 
 
-def once_more(following: Begin) -> Begin:
-    """Return the continuation with a free name, to be tried again since it could not begin."""
-    assert following.spec.continues is not None
-    return replace(following, path=free_name(following.path.with_name(following.spec.continues.first)))
+def once_more(following: Begin, why: str = "") -> Begin:
+    """Return the continuation with a free name, to be tried again; ``why`` it could not begin before."""
+    follows, window = following.spec.continues, following.window
+    assert follows is not None
+    if why not in ("", follows.cause):
+        window = replace(window, text=f"{window.text.partition(_THEN)[0]}{_THEN}{why}")
+    return replace(following, path=free_name(following.path.with_name(follows.first)), window=window)
 
 
 def free_name(path: Path) -> Path:

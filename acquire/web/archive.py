@@ -30,11 +30,11 @@ from acquire.store import (
     taint_words,
 )
 from acquire.store.attributes import upload_target
+from acquire.store.holds import holds_of
 from acquire.store.layout import DAMAGE
 from acquire.store.listing import SUFFIX, candidates, is_ours
 from acquire.store.opening import read_root, stated_format
 from acquire.store.refusals import refused
-from acquire.store.retention import holds_of
 from acquire.store.shortfall import damage_in_words
 from acquire.store.source import source_of
 from acquire.text import cause_in_words, shortened
@@ -54,8 +54,8 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from acquire.store import Outline, VideoFile
+    from acquire.store.holds import Hold
     from acquire.store.layout import Document
-    from acquire.store.retention import Hold
 
 MOST_LISTED = 500
 """Largest number of entries in a list; the newest are listed."""

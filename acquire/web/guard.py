@@ -148,7 +148,7 @@ class Guard:
         origin = request.headers.get("origin")
         same = origin is None or origin.partition("://")[2].lower() == request.headers.get("host", "").lower()
         if request.method not in SAFE and not (same and site in ("same-origin", "none")):
-            return _refuse(403, "the request comes from a page of another site")
+            return _refuse(403, "the request comes from a page of another site", "acquire web --link")
         if request.url.path in OPEN:
             return None
         return self._refusal_of_role(request, address)

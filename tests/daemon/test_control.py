@@ -6,6 +6,7 @@ import asyncio
 import contextlib
 import json
 import logging
+import random
 import socket
 import threading
 import time
@@ -354,6 +355,31 @@ def test_every_answer_is_documented(path: Path, daemon: Client) -> None:
                 operation["responses"]
             )
             assert all(one["description"] for one in operation["responses"].values())
+
+
+ODD = (None, 0, -1, 2**70, 1e308, "", "../..", "\0", "L2000", "0.5s", "x" * 500, [], {}, [1], True)
+
+
+def test_whatever_is_asked_the_answer_is_one_of_those_described(path: Path, daemon: Client) -> None:
+    """Odd values in every field and parameter of every request, in the states to which these lead."""
+    chance = random.Random(0)
+    with raw_client(path) as raw:
+        described = raw.get("/openapi.json").json()
+        requests = [
+            (method, url, operation)
+            for url, operations in described["paths"].items()
+            for method, operation in operations.items()
+            if url not in ("/events", "/capacity")  # a stream, and a measurement
+        ]
+        for method, url, operation in [one for one in requests for _ in range(12)]:
+            body = None
+            if "requestBody" in operation:
+                named = json.dumps(operation["requestBody"]).partition("/schemas/")[2].partition('"')[0]
+                fields = described["components"]["schemas"][named]["properties"]
+                body = {field: chance.choice(ODD) for field in fields if chance.random() < 0.5}
+            asked = {one["name"]: str(chance.choice(ODD)) for one in operation.get("parameters", [])}
+            answer = raw.request(method, url, params=asked, json=body)
+            assert str(answer.status_code) in {*operation["responses"]} - {"500"}, (method, url, asked, body)
 
 
 @pytest.fixture

@@ -143,6 +143,10 @@ def test_waiting_is_reported_when_it_begins_and_ends() -> None:
     assert [one["kind"] for one in changes.of(status(waiting="the disk, for 2 s"))] == ["waiting"]
     assert changes.of(status(waiting="the disk, for 3 s")) == []
     assert [one["text"] for one in changes.of(status())] == ["the wait is over"]
+    pause = "the recording will continue in a further segment once the disk allows it: "
+    for why in ("too slow to write", "no recording can begin in /d: its disk is not mounted on /d any more"):
+        assert [one["text"] for one in changes.of(status(waiting=pause + why))] == [pause + why]
+        assert changes.of(status(waiting=pause + why)) == []
 
 
 def test_old_news_are_not_repeated_when_a_run_begins() -> None:

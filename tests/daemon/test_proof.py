@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -48,10 +49,15 @@ def make_proof(directory: Path, *, real: bool = True) -> Proof:
 
 def test_a_sufficient_rate_is_measured_once(measured: dict[str, Any], tmp_path: Path) -> None:
     prove = make_proof(tmp_path)
-    for _ in range(3):
-        found = prove(force=False)
+    whole = [prove(force=False) for _ in range(3)]
+    for found in whole:
         assert (found.sustained_hz, found.limit, found.warning) == (1_000_000, "recorder", None)
     assert measured["times"] == 1
+    assert len({found.measured for found in whole}) == 1, "how old the number is"
+    assert whole[0].measured is not None
+    time.sleep(0.001)
+    assert (again := prove(force=False, fresh=True).measured) is not None
+    assert again > whole[0].measured
 
 
 def test_what_is_old_is_measured_again(

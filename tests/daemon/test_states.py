@@ -17,7 +17,7 @@ armed disarm idle
 armed fault faulted
 recording mark recording
 recording stop draining
-recording full draining
+recording ended draining
 recording fault faulted
 draining mark draining
 draining sealed armed

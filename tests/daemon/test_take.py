@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from acquire.daemon.take import MOST_NAMED, Take, log_event
+from acquire.daemon.take import MOST_NAMED, Take, and_then, log_event, with_cause
 from acquire.stream import CaptureStatus, Note
 
 SEEN = replace(CaptureStatus(), first_line=1000, committed_lines=100)
@@ -20,6 +20,14 @@ def test_marks_after_the_last_line_are_named() -> None:
     log_event(Note(1200, "input", "no mark"), take)
     assert take.marks_after(SEEN).endswith("sure to have all: 'at 1100', 'at 1200'")
     assert take.marks_after(replace(SEEN, committed_lines=201)) == ""
+
+
+def test_a_failure_says_its_reason_once() -> None:
+    """What went wrong after it is added only if it is something else."""
+    assert and_then("the disk is full", "the disk is full") == "the disk is full"
+    assert and_then("no seal: the disk is full", "the disk is full") == "no seal: the disk is full"
+    assert and_then("the disk is full", "b hangs") == "the disk is full; then, while ending: b hangs"
+    assert with_cause("b hangs", replace(SEEN, end_reason="the disk is full"), ending=False) == "b hangs"
 
 
 def test_of_many_marks_the_first_are_named_and_all_are_in_the_log(caplog: pytest.LogCaptureFixture) -> None:

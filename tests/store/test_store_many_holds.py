@@ -11,7 +11,8 @@ from store_helpers import fill, make_spec
 
 from acquire.errors import DataError
 from acquire.store import RecordingWriter, Retention, RunCondition, hold, open_recording
-from acquire.store.retention import HOLDS, LONGEST_WHY
+from acquire.store.holds import HOLDS
+from acquire.store.retention import LONGEST_WHY
 
 
 @pytest.mark.needs_mount

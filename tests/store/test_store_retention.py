@@ -10,7 +10,16 @@ import zarr
 from store_helpers import Truth, fill, make_spec
 
 from acquire.errors import DataError, PlaceError, UsageError
-from acquire.store import RecordingWriter, Retention, RunCondition, hold, open_recording, recover, verify
+from acquire.store import (
+    RecordingWriter,
+    Retention,
+    RunCondition,
+    hold,
+    holds,
+    open_recording,
+    recover,
+    verify,
+)
 from acquire.store.files import Disk
 from acquire.store.removal import COPY, shard_files
 from acquire.store.retention import Keeper, keep_from, shard_bytes
@@ -310,3 +319,41 @@ def test_events_that_follow_each_other_are_one_hold(path):
         keeper.note("mark", line)
     keeper.note("started", 3000)
     assert [(hold.first_line, hold.count) for hold in keeper.holds] == [(1000, 51), (1990, 32)]
+
+
+def test_a_hold_is_read_again_only_if_it_has_changed(path, monkeypatch):
+    """There may be thousands, and ten commits a second."""
+    read, now_s = [], [100.0]
+    original = holds.read_object
+    monkeypatch.setattr(
+        holds, "read_object", lambda file, **more: read.append(file.name) or original(file, **more)
+    )
+
+    def look(later_s):
+        read.clear()
+        now_s[0] += later_s
+        return [(held.first_line, held.count, held.why) for held in files.read()], list(read)
+
+    with RecordingWriter.create(path, spec_of(AGE)) as writer:
+        grow(writer, 2 * SHARD)
+        files = holds.HoldFiles(path, lambda: now_s[0])
+        assert look(0.0) == ([], [])
+        hold(path, 1000, 5, "one")
+        keep_from(path, 1010, "file:///copy")
+        (copy,) = (path / "a" / "lines" / holds.HOLDS).glob("0-*.json")
+        names = [copy.name, "1000-5.json"]
+        for _ in range(2):  # changed twice within a step of the clock, they would look the same
+            assert look(2.0) == ([(1010, 2**62, "not copied yet"), (1000, 5, "one")], names)
+        assert look(2.0)[1] == names
+        assert look(0.1) == ([(1010, 2**62, "not copied yet"), (1000, 5, "one")], [])
+        keep_from(path, 1020, "file:///copy")
+        hold(path, 1001, 5, "two")
+        assert look(0.1) == (
+            [(1020, 2**62, "not copied yet"), (1000, 5, "one"), (1001, 5, "two")],
+            [copy.name, "1001-5.json"],
+        )
+        (copy.parent / "1000-5.json").write_text('{"first_line": 900, "count": 5, "why": "by hand"}')
+        assert look(9.0)[0][1:] == [(900, 5, "by hand"), (1001, 5, "two")]
+        assert look(9.0)[1] == ["1000-5.json"]
+        copy.unlink()
+        assert look(0.1) == ([(900, 5, "by hand"), (1001, 5, "two")], [])

@@ -83,6 +83,7 @@ WAYS = {
 ROWS = {"a": 900, "b": 890}
 SEALED = Sealed(RunCondition.GOOD, "line budget reached", {})
 LINES = 5000
+MOUNT = Path("/")
 END_LINE = 500 + LINES
 CUT_SHORT = Sealed(RunCondition.INTERRUPTED, "too slow to write", {}, end_line=1400)
 
@@ -105,7 +106,7 @@ class Bench:
         ways: dict[Event, Callable[[], object]] = {
             Event.BEGIN: lambda: life.begin(Begin(begun, make_spec(), self.lines)),
             Event.END: lambda: life.end("stopped"),
-            Event.BEGAN: lambda: life.on_began(Began(500, end_line), 10.0),
+            Event.BEGAN: lambda: life.on_began(Began(500, end_line, MOUNT), 10.0),
             Event.REFUSED: lambda: life.on_refused(Refused(StoreError("the disk is full")), 10.0),
             Event.OVERDUE: life.on_overdue,
             Event.KILLED: lambda: life.on_killed("killed by SIGKILL", 850, 10.0),
@@ -218,6 +219,9 @@ def test_a_further_segment_that_fails_is_tried_again_later(tmp_path: Path, then:
         assert again is not None
         assert again.spec.continues is not None
         assert again.spec.continues.number == 2
+        assert again.mount == MOUNT, "its disk has to be there still"
+    why = bench.life.resumption.why
+    assert again.window.text == f"continues from r.zarr: too slow to write; and then {why}"
 
 
 @pytest.mark.parametrize("event", [Event.END, Event.FAULT])
@@ -246,7 +250,7 @@ def test_a_segment_that_was_being_created_is_extended_once_it_has_begun(tmp_path
     bench.life.due(10.0)
     bench.life.extend(7000)
     assert bench.happen(Event.BEGAN) == Extend(7000)
-    assert bench.life.began == Began(500, 7000)
+    assert bench.life.began == Began(500, 7000, MOUNT)
     assert Bench(tmp_path / "as-asked", stage, LINES).happen(Event.BEGAN) is None
 
 

@@ -19,6 +19,7 @@ from acquire.errors import StateError, StoreError
 from acquire.lines import ARMS
 from acquire.processes.shared import Counters
 from acquire.store import RunCondition, Suspect, open_recording, suspect_lines
+from acquire.store.mount import mount_above
 from acquire.store.suspect import DOUBTFUL, VERIFIED
 from acquire.stream import recorder_states
 from acquire.stream.external_counts import ExternalCounts
@@ -250,7 +251,7 @@ def test_lines_are_discarded_until_the_recording_can_take_them(bed: Bed, tmp_pat
     first_line = bed.line
     bed.lines(5)
     # The turn that finds the recording ready has met the block that came before it.
-    assert bed.post.said == [Began(first_line + ROWS)]
+    assert bed.post.said == [Began(first_line + ROWS, mount=mount_above(tmp_path))]
     bed.post.waiting.append(End("stopped"))
     bed.recorder.turn()
     bed.disk.finish()
@@ -405,7 +406,7 @@ def test_a_recording_waits_for_rings_that_are_about_to_overflow(bed: Bed, tmp_pa
     bed.recorder.turn()
     assert bed.post.said == []
     bed.recorder.turn()
-    assert bed.post.said == [Began(bed.line + (SLOTS + 1) * ROWS)]
+    assert bed.post.said == [Began(bed.line + (SLOTS + 1) * ROWS, mount=mount_above(tmp_path))]
     bed.post.waiting.append(End("stopped"))
     assert bed.sealed().ledger["a"]["missing"] == {}
 

@@ -75,6 +75,7 @@ def ask(method: str, path: str, *requests: dict[str, str]) -> list[httpx.Respons
         ("GET", "/api/status", {**OPERATOR, "Host": "evil.example"}, 421),
         ("GET", "/", {"Host": "evil.example:8300"}, 421),
         ("GET", "/api/healthz", {}, 200),
+        ("GET", "/api/metrics", VIEWER, 200),  # as Prometheus does
     ],
 )
 def test_who_may_do_what(method: str, path: str, headers: dict[str, str], code: int) -> None:

@@ -108,6 +108,12 @@ def test_a_take_from_arming_to_the_video(page: Page, daemon: Daemon) -> None:
     assert page.locator("#frame-text", has_text=f"of {video.video.shape[0]},").is_visible()
     page.locator("body").press(" ")
     page.locator("#frame-text", has_not_text="Frame 2 of").wait_for(timeout=SEEN_MS)
+    assert page.evaluate("document.querySelector('#first-line').clientWidth") > 120, "a month has 11 digits"
+
+    page.keyboard.press("1")
+    page.wait_for_selector("#arms .none", state="hidden", timeout=SEEN_MS)
+    page.keyboard.press("d")
+    page.locator("#arms .past .none", has_text="Not live").first.wait_for(timeout=SEEN_MS)
 
     os.kill(
         daemon.process.pid, signal.SIGKILL

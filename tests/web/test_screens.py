@@ -71,6 +71,9 @@ class Instrument:
             def came_back(self) -> bool:
                 return False
 
+            def other(self) -> str:
+                return ""
+
             def refuse(self, path: Path) -> None: ...
             def close(self) -> None: ...
 
@@ -179,9 +182,40 @@ def test_every_state_is_shown_in_words_and_fits(name: str, page: Page, instrumen
             page.set_viewport_size({"width": width, "height": 900})
             wide = page.evaluate("document.documentElement.scrollWidth")
             assert wide <= width, f"{name} is {wide} px wide where {width} are to be had"
+            assert page.is_visible("#left"), "what is left is read at a glance, on a telephone as well"
             if SCREENSHOTS:
                 file = f"{name.replace(' ', '-')}-{theme}-{width}.png"
                 page.screenshot(path=Path(SCREENSHOTS) / file, full_page=width == 400)
+
+
+def test_one_of_a_thing_is_singular_and_a_fault_says_its_reason_once(
+    page: Page, instrument: Instrument
+) -> None:
+    def lost(count: int) -> None:
+        calm = instrument.run.seen.lines
+        instrument.see(lines={**calm, "a": {**calm["a"], "lost": {"camera": count}}})
+
+    def sentence(text: str) -> None:
+        page.locator("#sentence", has_text=re.compile(f"^{text}$")).wait_for(timeout=SEEN_MS)
+
+    counted = (
+        "import('/static/words.js').then(({ counted }) => [0, 1, 2, 1000].map((n) => counted(n, 'line')))"
+    )
+    assert page.evaluate(counted) == ["0 lines", "1 line", "2 lines", "1\u202f000 lines"]
+    arm(instrument)
+    instrument.client.start(Path("/d/x.zarr"), lines=1)
+    page.locator("#left", has_text=re.compile("^1 line$")).wait_for(timeout=SEEN_MS)
+    lost(1)
+    sentence("1 line was lost since the instrument was armed.")
+    lost(2)
+    sentence("2 lines were lost since the instrument was armed.")
+    instrument.run.refuse["close"] = CameraError("camera b does not answer")
+    instrument.see(fault="camera b does not answer")
+    sentence("Fault: camera b does not answer; before that, 2 lines were lost.")
+    page.locator("#arms .none", has_text="Disarm it, then arm it again").first.wait_for(timeout=SEEN_MS)
+    instrument.client.disarm()
+    sentence("2 lines were lost in the previous run.")
+    assert "available now" not in page.inner_text("#now"), "there are no rings any more"
 
 
 def test_a_loss_stays_until_it_is_acknowledged(page: Page, instrument: Instrument) -> None:
@@ -239,6 +273,7 @@ def test_all_can_be_reached_and_done_by_key(page: Page, instrument: Instrument) 
 def test_keys_work_on_every_screen(page: Page, instrument: Instrument) -> None:
     """A recording is stopped from wherever one is."""
     record(instrument)
+    page.focus("#glimpse-on")  # a box that was ticked keeps the focus, and takes no letters
     page.keyboard.press("3")
     page.wait_for_selector("#recordings:not([hidden])")
     page.wait_for_selector("#stop:enabled", state="attached", timeout=SEEN_MS)

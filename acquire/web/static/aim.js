@@ -1,7 +1,7 @@
 // Alignment of a new instrument: one large camera with its sharpness, brightness and light profile.
 
 import { Waterfall } from "./waterfall.js";
-import { $, make, percent } from "./words.js";
+import { $, make, noLines, percent } from "./words.js";
 
 export class Aim {
   #fall; #none = make("p", { className: "none" }); #run = null; #peak = 0; #smooth = null; #shown = new Float64Array(1); #profile; #focus = make("output"); #best = make("output"); #white = make("output");
@@ -21,8 +21,9 @@ export class Aim {
   show(status, liveError) {
     if (status.run_id !== this.#run) { this.#run = status.run_id; if (status.run_id) this.#fall.clear(); }
     if (liveError) this.#fall.clear();
-    this.#none.textContent = liveError ? `No picture: ${liveError}` : status.state === "idle" ? "No lines: arm the instrument." : "Waiting for lines.";
-    this.#none.hidden = !this.#fall.isEmpty;
+    this.#none.textContent = liveError ? `No picture: ${liveError}` : noLines(status, this.#fall.isEmpty);
+    this.#none.hidden = Boolean(status.run_id) && !this.#fall.isEmpty;
+    $("aim-view").classList.toggle("past", !status.run_id && !this.#fall.isEmpty);
     if (!$("aim").hidden) this.#draw();
   }
 

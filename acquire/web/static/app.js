@@ -66,11 +66,11 @@ link.addEventListener("state", ({ detail }) => {
 
 addEventListener("hashchange", screen);
 addEventListener("keydown", (event) => {
-  if (event.ctrlKey || event.metaKey || event.altKey || document.querySelector("dialog[open]") || event.target.closest("input, select, textarea")) return;
+  if (event.ctrlKey || event.metaKey || event.altKey || document.querySelector("dialog[open]") || event.target.closest("input:not([type=checkbox]), select, textarea")) return;
   if (event.key === "?") { $("keys").showModal(); return; }
   const number = SCREENS[Number(event.key) - 1];
   if (number) { location.hash = `/${number}`; return; }
-  const onButton = event.target.closest("button, a") && [" ", "Enter"].includes(event.key);
+  const onButton = event.target.closest("button, a, input") && [" ", "Enter"].includes(event.key);
   if (onButton || event.repeat) return;
   const played = !$("recordings").hidden && recordings.key(event.key);
   if (played || watch.key(event.key.toLowerCase())) event.preventDefault();

@@ -27,7 +27,7 @@ export class Band {
     $("state").textContent = WORDS[status.state];
     $("flag").textContent = unseen ? "lines lost" : document.body.dataset.level === "degraded" ? "degraded" : "";
     $("since").textContent = status.busy ? `${status.busy} …` : `for ${duration(forS)}`;
-    $("sentence").textContent = unseen && !health.lost_lines ? `${counted(this.#sticky, "line")} ${this.#sticky === 1 ? "was" : "were"} lost in the previous run.` : health.sentence;
+    $("sentence").textContent = unseen && !health.lost_lines ? this.#lostBefore(health) : health.sentence;
     [$("left-label").textContent, $("left").textContent] = left(status);
     $("rig").textContent = status.name;
     document.title = `${WORDS[status.state].toUpperCase()}${unseen ? " – LINES LOST" : ""} · ${status.name}`;
@@ -44,6 +44,12 @@ export class Band {
     $("sentence").textContent = why;
     document.title = "NO CONTACT · acquire";
     this.#announce(`No contact. ${why}`, "stale");
+  }
+
+  /** A fault has ended the run that lost the lines, and is what there is to be read first. */
+  #lostBefore(health) {
+    const were = `${counted(this.#sticky, "line")} ${this.#sticky === 1 ? "was" : "were"} lost`;
+    return health.level === "fault" ? `${health.sentence}; before that, ${were}.` : `${were} in the previous run.`;
   }
 
   #lost() {

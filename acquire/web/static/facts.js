@@ -18,11 +18,11 @@ export function showHealth(status, health, fail, operator) {
     wide(panel("Checks against fixed thresholds", table(["check", "", "now", "thresholds"], health.checks.map((check) =>
       [check.name, make("span", { className: check.level }, MARKS[check.level]), check.text, check.limit])))),
     panel("What this host sustains", capacity
-      ? make("p", {}, capacity.warning ?? `${quantity(capacity.sustained_hz ?? 0, "lines/s")}; ${quantity(capacity.line_rate_hz, "lines/s")} are configured; the limit is: ${capacity.limit}.`)
+      ? make("p", {}, capacity.warning ?? `${quantity(capacity.sustained_hz ?? 0, "lines/s")}; ${quantity(capacity.line_rate_hz, "lines/s")} are configured; the limit is: ${capacity.limit}.`, capacity.measured ? ` Measured on ${new Date(capacity.measured).toLocaleString("en-GB")}.` : "")
       : make("p", {}, "Not measured since the daemon started."),
     make("button", { id: "measure", disabled: !operator || status.state !== "idle" || Boolean(status.busy), onclick: () => { fail(""); ask("POST", "capacity").catch((error) => fail(error.message)); } }, "Measure now"),
     make("p", { className: "hint" }, "Only while the instrument is idle.")),
-    panel("Processes", table(["name", "PID"], [["daemon", String(status.pid)], ...Object.entries(status.processes).map(([name, pid]) => [name, String(pid)])])),
+    panel("Processes", table(["name", "PID"], [["daemon", String(status.pid)], ...Object.entries(status.processes).map(([name, pid]) => [/^[ab]+$/.test(name) ? `grabber ${name}` : name, String(pid)])])),
     panel("Uploads", status.uploads.length ? table(["recording", "state", "lines uploaded", "reason"], status.uploads.map((one) => [one.path.split("/").at(-1), one.state, count(one.lines), one.error])) : make("p", {}, "None.")),
     panel("Recoveries", status.recoveries.length ? table(["recording", "state", ""], status.recoveries.map((one) => [one.path.split("/").at(-1), one.state, one.text])) : make("p", {}, "None.")),
     panel("Unexpected failures", status.troubles.length ? table(["last", "failure", "count"], status.troubles.map((one) => [clock(one.last), one.text, String(one.times)])) : make("p", {}, "None.")))]);

@@ -1,6 +1,6 @@
 // A coarse video of the latest lines: its frames are repeated until the next glimpse arrives.
 
-import { $, counted } from "./words.js";
+import { $, counted, duration } from "./words.js";
 
 const FRAME_MS = 80;
 /** A glimpse is reported as late after this time, while the frames of the previous one are still repeated. */
@@ -35,7 +35,7 @@ export class Glimpse {
   #draw() {
     if (!this.#header) return;
     const late_s = (performance.now() - this.#taken) / 1000;
-    if (late_s > LATE_S) $("glimpse-text").textContent = `${this.#words}; no new one for ${Math.round(late_s)} s`;
+    if (late_s > LATE_S) $("glimpse-text").textContent = `${this.#words}; no new one for ${duration(late_s)}`;
     const { rows, columns, frames } = this.#header, canvas = $("glimpse"), size = rows * columns, image = new ImageData(columns, rows);
     const bytes = this.#body.subarray(this.#frame * size, (this.#frame + 1) * size);
     for (let i = 0; i < size; i++) image.data.set([bytes[i], bytes[i], bytes[i], 255], 4 * i);

@@ -60,7 +60,7 @@ export class Recordings {
 
   #build() {
     const one = this.#detail, off = !this.#operator;
-    const first = make("input", { id: "first-line", type: "number", min: one.first_line, value: this.#from }), lines = make("input", { id: "line-count", type: "number", min: 1, max: one.lines, value: this.#lines });
+    const first = make("input", { id: "first-line", className: "long", type: "number", min: one.first_line, value: this.#from }), lines = make("input", { id: "line-count", type: "number", min: 1, max: one.lines, value: this.#lines });
     const side = make("input", { id: "voxel-side", type: "number", min: 1, max: 64, value: 3 }), time = make("input", { id: "voxel-time", type: "number", min: 1, max: 4096, value: 1 });
     const preset = make("select", { id: "preset" }, ...["fast", "balanced", "best"].map((text) => make("option", { selected: text === "balanced" }, text)));
     const strip = this.#strip(one, first, lines);
@@ -85,7 +85,7 @@ export class Recordings {
       context.fillStyle = "#2f6fd077"; context.fillRect(x(Number(first.value)), 0, Math.max(2, x(Number(first.value) + Number(lines.value)) - x(Number(first.value))), height);
       context.fillStyle = "#3fa36a"; for (const held of one.hold_list) context.fillRect(x(held.first_line), height - 8, Math.max(2, x(held.first_line + held.count) - x(held.first_line)), 8);
       context.fillStyle = "#e62ebe"; for (const gap of one.gap_list) context.fillRect(x(gap.first_line), gap.arm === "a" ? 8 : 24, Math.max(2, x(gap.first_line + gap.count) - x(gap.first_line)), 14);
-      context.fillStyle = "#ffd166"; for (const event of one.event_list) { context.beginPath(); context.arc(x(event.line), height / 2 + 8, 5, 0, 7); context.fill(); }
+      context.fillStyle = "#ffd166"; for (const event of one.event_list) { context.beginPath(); context.arc(Math.min(width - 5, Math.max(5, x(event.line))), height / 2 + 8, 5, 0, 7); context.fill(); }
     };
     const choose = (from, n) => { first.value = Math.round(from); lines.value = Math.max(1, Math.round(Math.min(n, one.first_line + one.lines - from))); draw(); };
     const lineAt = (event) => one.first_line + Math.min(1, Math.max(0, event.offsetX / element.clientWidth)) * one.lines;
@@ -94,6 +94,7 @@ export class Recordings {
     element.addEventListener("pointermove", (event) => { if (begun !== null) choose(Math.min(begun, lineAt(event)), Math.abs(lineAt(event) - begun)); });
     element.addEventListener("pointerup", () => { begun = null; });
     for (const input of [first, lines]) input.addEventListener("input", draw);
+    new ResizeObserver(draw).observe(element);
     return { element, draw, choose };
   }
 

@@ -2,7 +2,7 @@
 
 import { ask } from "./link.js";
 import { Histogram, SHOWN_S, Waterfall } from "./waterfall.js";
-import { $, clock, count, counted, duration, fill, make, percent, quantity } from "./words.js";
+import { $, clock, count, counted, duration, fill, make, noLines, percent, quantity } from "./words.js";
 
 const HOLD_MS = 600;
 const MOST_EVENTS = 60;
@@ -111,7 +111,7 @@ export class Watch {
   }
 
   #now(status) {
-    const past = Object.values(status.arms).map((arm) => arm.ring.history / arm.ring.slots), facts = [];
+    const past = Object.values(status.run_id ? status.arms : {}).map((arm) => arm.ring.history / arm.ring.slots), facts = [];
     const history = this.#setup && past.length ? Math.min(this.#setup.history_s, Math.min(...past) * this.#setup.history_s * (4 / 3)) : null;
     facts.push(["Recording", status.recording ? `${name(status.recording.path)}, ${counted(status.recording.recorded_lines, "line")}, ${count(status.recording.committed_lines)} readable` : "–"]);
     facts.push(["Pre-trigger", history === null ? "–" : `${history.toFixed(1)} s available now`]);
@@ -137,7 +137,7 @@ export class Watch {
 const name = (path) => path.split("/").at(-1);
 
 class Arm {
-  #fall; #histogram; #numbers = make("span"); #level = make("span"); #none; #canvas; #run = null; #configured = 0;
+  #fall; #histogram; #newest = make("span", {}, "now"); #numbers = make("span"); #level = make("span"); #none; #canvas; #run = null; #configured = 0;
 
   constructor(arm) {
     this.arm = arm;
@@ -149,7 +149,7 @@ class Arm {
     this.bars = bars;
     this.element = make("article", { className: "arm", "aria-label": `Camera ${arm.toUpperCase()}` },
       make("header", {}, make("b", {}, `Camera ${arm.toUpperCase()}`), this.#numbers, this.#level),
-      make("div", { className: "fall" }, make("div", { className: "scale", "aria-hidden": "true" }, make("span", {}, `−${SHOWN_S} s`), make("span", {}, "now")), this.#canvas, this.#none), bars,
+      make("div", { className: "fall" }, make("div", { className: "scale", "aria-hidden": "true" }, make("span", {}, `−${SHOWN_S} s`), this.#newest), this.#canvas, this.#none), bars,
       make("div", { className: "axis", "aria-hidden": "true" }, make("span", {}, "black"), make("span", {}, "pixels by value, logarithmic"), make("span", {}, "white")));
     this.#fall.clear();
   }
@@ -160,8 +160,10 @@ class Arm {
     if (status.run_id !== this.#run) { this.#run = status.run_id; if (status.run_id) { this.#fall.clear(); this.#histogram.clear(); } }
     // The last picture must not stand there as if it were the newest.
     if (liveError) this.#fall.clear();
-    this.#none.hidden = !this.#fall.isEmpty;
-    this.#none.textContent = liveError ? `No picture: ${liveError}` : status.run_id ? "Waiting for lines." : "No lines: arm the instrument.";
+    this.#none.hidden = Boolean(status.run_id) && !this.#fall.isEmpty;
+    this.#none.textContent = liveError ? `No picture: ${liveError}` : noLines(status, this.#fall.isEmpty);
+    this.element.classList.toggle("past", !status.run_id && !this.#fall.isEmpty);
+    this.#newest.textContent = status.run_id ? "now" : "end";
     if (!arm) { this.#numbers.textContent = ""; return; }
     const verdict = arm.check ? `code ${arm.check.verdict.replaceAll("_", " ")}${arm.check.shift ? ` ${arm.check.shift > 0 ? "+" : ""}${arm.check.shift}` : ""}` : "code not checked";
     const text = `${quantity(arm.rate_hz, "lines/s")} · ring ${percent(arm.ring.fill / arm.ring.slots)} · ${verdict}`;

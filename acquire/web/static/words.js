@@ -30,6 +30,13 @@ export const count = (value) => Number(value).toLocaleString("en").replaceAll(",
 /** "1 line", "3 lines". */
 export const counted = (value, noun) => `${count(value)} ${noun}${Number(value) === 1 ? "" : "s"}`;
 
+/** Why there is no picture of a camera, or only an old one, and what to do. */
+export function noLines(status, isEmpty) {
+  if (status.state === "faulted") return "No lines: the instrument has failed. Disarm it, then arm it again.";
+  if (status.run_id) return "Waiting for lines.";
+  return isEmpty ? "No lines: arm the instrument." : "Not live: these are the last lines before the instrument was disarmed.";
+}
+
 export function quantity(value, unit) {
   for (const [factor, prefix] of [[1e12, "T"], [1e9, "G"], [1e6, "M"], [1e3, "k"]])
     if (Math.abs(value) >= factor) return `${Number((value / factor).toPrecision(3))}\u202f${prefix}${unit}`;
