@@ -94,6 +94,8 @@ def is_journal(file: int) -> bool:
 class _Count:
     began_s: float
     most: int
+    text: str
+    """Of the first entry."""
     seen: int = 0
 
 
@@ -115,9 +117,12 @@ class Bounded(logging.Filter):
             del self._counts[kind]
             if count.seen > count.most:
                 more = counted(count.seen - count.most, "more entry", "was")
-                self._report(f"{more} not written, like this: {kind[2]}")
+                self._report(f"{more} not written, like this: {count.text}")
         kind = (record.name, record.levelno, str(record.msg)[:MOST_CHARACTERS])
-        count = self._counts.setdefault(kind, _Count(now_s, getattr(record, "most", REPEATS)))
+        count = self._counts.get(kind)
+        if count is None:
+            text = visible(record.getMessage())[:MOST_CHARACTERS]
+            count = self._counts[kind] = _Count(now_s, getattr(record, "most", REPEATS), text)
         count.seen += 1
         return count.seen <= count.most
 

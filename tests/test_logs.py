@@ -44,7 +44,7 @@ def test_repeated_entries_are_counted_instead() -> None:
     assert told == []
     clock[0] = WINDOW_S
     assert bounded.filter(record("too many files: %d", 1))
-    assert told == [f"{1000 - REPEATS} more entries were not written, like this: too many files: %d"]
+    assert told == [f"{1000 - REPEATS} more entries were not written, like this: too many files: 0"]
 
 
 def test_entries_about_recordings_are_no_repetitions() -> None:
