@@ -119,10 +119,10 @@ class Bounded(logging.Filter):
                 more = counted(count.seen - count.most, "more entry", "was")
                 self._report(f"{more} not written, like this: {count.text}")
         kind = (record.name, record.levelno, str(record.msg)[:MOST_CHARACTERS])
-        count = self._counts.get(kind)
-        if count is None:
+        if kind not in self._counts:
             text = visible(record.getMessage())[:MOST_CHARACTERS]
-            count = self._counts[kind] = _Count(now_s, getattr(record, "most", REPEATS), text)
+            self._counts[kind] = _Count(now_s, getattr(record, "most", REPEATS), text)
+        count = self._counts[kind]
         count.seen += 1
         return count.seen <= count.most
 
