@@ -7,12 +7,13 @@ light, an uneven beam splitter, and an arm B that is shifted, rotated and magnif
 point spread. Dark, flat and target are recorded with ``--lines`` lines each and calibrated as `acquire
 calibrate` does; the target consists of random dots of 2 to 6 fine pixels. In every second instrument the
 flat's light ends at the field's edge. Then a scene of three lamps of random shapes, positions and frequencies
-is reconstructed from 263 lines (voxels 3 x 1): as recorded, calibrated, from lines with only the same noise,
-and from lines that also have the splitter's unequal shares and the ambient light, exactly known (known_db):
-no calibration takes away the noise that these add. Columns: errors of shift (fine pixels), rotation
-(degrees), DN per electron (%), gains and offsets in the worst column that the optics do not hide (%, DN;
-gain_inner: without the outermost columns, where light lost at the field's edge is mistaken for gain), the
-splitter (%), PSNR in dB, seconds.
+is reconstructed from 263 lines (voxels 3 x 1): as recorded, calibrated, with the instrument's true properties
+instead of measured ones (exact_db: what no better calibration would exceed, but for chance), from lines with
+only the same noise, and from lines that also have the splitter's unequal shares and the ambient light,
+exactly known (known_db): no calibration takes away the noise that these add. Columns: errors of shift (fine
+pixels), rotation (degrees), DN per electron (%), gains and offsets in the worst column that the optics do not
+hide (%, DN; gain_inner: without the outermost columns, where light lost at the field's edge is mistaken for
+gain), the splitter (%), PSNR in dB, seconds.
 
 --orientations draws 24 instruments instead (eight views of arm B, three targets each) and counts the answers.
 --measured takes the instrument of configs/scene-leds-measured.toml and its four lamps instead, with arm B
@@ -31,7 +32,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
+from scipy.ndimage import gaussian_filter1d
 
+from acquire.alignment import Alignment
+from acquire.blur import Blur
 from acquire.calibrate import Calibration, calibrated
 from acquire.calibrate.columns import dark, flat
 from acquire.calibrate.exposure import instrument_of, open_exposure
@@ -42,6 +46,7 @@ from acquire.calibrate.transfer import transfer
 from acquire.calibrate.veil import veil
 from acquire.config import load_rig, load_scene
 from acquire.forward import merge_video
+from acquire.noise import Noise
 from acquire.recon import reconstruct
 from acquire.sim.leds import LedSceneConfig
 from acquire.sim.media import VideoSceneConfig
@@ -287,7 +292,7 @@ def fixed(drawn: Drawn, kind: str, kinds: tuple[str, ...], directory: Path) -> N
 
 
 def pictures(drawn: Drawn, known: Calibration, directory: Path) -> dict[str, float]:
-    """PSNR of the reconstructed lamps: as recorded, calibrated, and with noise only."""
+    """PSNR of the reconstructed lamps: as recorded, calibrated, in an exact model, and with noise only."""
     noise = [effect for effect in drawn.effects if effect["kind"] in NOISE]
     light = [effect for effect in drawn.effects if effect["kind"] in (*NOISE, *drawn.known)]
     paths = {
@@ -299,6 +304,7 @@ def pictures(drawn: Drawn, known: Calibration, directory: Path) -> dict[str, flo
     cases = {
         "raw": cuts["raw"],
         "calibrated": calibrated(cuts["raw"], known),
+        "exact": exact(drawn, cuts["raw"], directory),
         "noise": cuts["noise"],
         "known": replace(
             cuts["known"],
@@ -316,6 +322,27 @@ def pictures(drawn: Drawn, known: Calibration, directory: Path) -> dict[str, flo
         found[f"{name}_db"] = _psnr(segment, truth)
         found[f"{name}_s"] = time.perf_counter() - began
     return found
+
+
+def exact(drawn: Drawn, segment: Segment, directory: Path) -> Segment:
+    """The segment with the instrument's true properties, as far as a calibration has them."""
+    effects = {effect["kind"]: effect for effect in drawn.effects}
+    part_a, veil = effects["beam_splitter"]["part_a"], effects["stray_light"].get("veil", 0.0)
+    flats = [fixed(drawn, "flat", kinds, directory) - BLACK_DN for kinds in (("prnu",), ())]
+    gain = flats[0] / flats[1] * np.array([[2 * part_a], [2 - 2 * part_a]])
+    sigma = effects["psf"]["sigma_pixels"] if "psf" in effects else 0.0
+    # the simulated kernel is sampled at whole pixels, which changes its width
+    spread = gaussian_filter1d(np.eye(1, 129, 64)[0], sigma) if sigma else np.eye(1, 129, 64)[0]
+    width = float(np.sqrt((spread * np.arange(-64, 65) ** 2).sum()))
+    return replace(
+        segment,
+        black_level_dn=fixed(drawn, "dark", DARK, directory),
+        responsivity_dn=gain * np.asarray(segment.responsivity_dn),
+        balanced=True,
+        alignment=Alignment(drawn.rows, drawn.columns, drawn.turn_deg, drawn.magnification),
+        blur=Blur((width, width), (width, width), veil=(veil, veil)) if width or veil else None,
+        noise=Noise((K, K), (25.0 * K, 25.0 * K)),
+    )
 
 
 def _psnr(segment: Segment, truth: NDArray[np.float32]) -> float:

@@ -86,21 +86,7 @@ def _runs_both_ways(alignment: Alignment, size: int, spatial_merge: int, dtype: 
 
 def sampling_matrix(alignment: Alignment, size: int, spatial_merge: int = 1) -> sparse.csr_array:
     """Return R (n′², n′²), with rows and columns in the order of a frame's elements."""
-    rows, columns = (np.clip(each, 0, size - 1).ravel() for each in alignment.sources(size))
-    row, column = (each.astype(np.int64) for each in (rows, columns))
-    below, right = rows - row, columns - column
-    # at the last row or column the fraction is 0, so that any valid neighbour will do
-    next_row, next_column = (np.minimum(each + 1, size - 1) for each in (row, column))
-    corners = [
-        ((1 - below) * (1 - right), row * size + column),
-        ((1 - below) * right, row * size + next_column),
-        (below * (1 - right), next_row * size + column),
-        (below * right, next_row * size + next_column),
-    ]
-    weights, sources = (np.concatenate(each) for each in zip(*corners, strict=True))
-    pixels = np.tile(np.arange(size**2), len(corners))
-    # `tocsr` adds up the weights of corners that coincide there
-    fine = sparse.coo_array((weights, (pixels, sources)), shape=(size**2, size**2)).tocsr()
+    fine = interpolation(*alignment.sources(size))
     if spatial_merge == 1:
         # whole-pixel shifts leave corners of weight 0, which would take as long as the others
         fine.eliminate_zeros()
@@ -114,6 +100,29 @@ def sampling_matrix(alignment: Alignment, size: int, spatial_merge: int = 1) -> 
     merged: sparse.csr_array = (means @ fine @ held).tocsr()
     merged.eliminate_zeros()
     return merged
+
+
+def interpolation(rows: NDArray[np.float64], columns: NDArray[np.float64]) -> sparse.csr_array:
+    """Return the matrix that takes a frame to its values at places of the same shape, bilinear.
+
+    Beyond the edge, the edge continues.
+    """
+    high, wide = rows.shape
+    rows, columns = np.clip(rows, 0, high - 1).ravel(), np.clip(columns, 0, wide - 1).ravel()
+    row, column = (each.astype(np.int64) for each in (rows, columns))
+    below, right = rows - row, columns - column
+    # at the last row or column the fraction is 0, so that any valid neighbour will do
+    next_row, next_column = np.minimum(row + 1, high - 1), np.minimum(column + 1, wide - 1)
+    corners = [
+        ((1 - below) * (1 - right), row * wide + column),
+        ((1 - below) * right, row * wide + next_column),
+        (below * (1 - right), next_row * wide + column),
+        (below * right, next_row * wide + next_column),
+    ]
+    weights, sources = (np.concatenate(each) for each in zip(*corners, strict=True))
+    places = np.tile(np.arange(high * wide), len(corners))
+    # `tocsr` adds up the weights of corners that coincide there
+    return sparse.coo_array((weights, (places, sources)), shape=(high * wide, high * wide)).tocsr()
 
 
 def interpolation_variance(alignment: Alignment, size: int) -> tuple[float, float]:

@@ -16,15 +16,17 @@ from functools import lru_cache
 from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy.ndimage import map_coordinates
 
+from acquire.forward import interpolation
 from acquire.recon.gaussian import Fit, Model, Prior, Response, best_model
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
     from numpy.typing import NDArray
+    from scipy import sparse
 
+    from acquire.alignment import Alignment
     from acquire.lines import Segment
 
     Floats = NDArray[np.float64]
@@ -72,18 +74,27 @@ def _transposed(scene: Scene) -> Scene:
     return np.asarray(np.repeat(merged.transpose(2, 1, 0), finer, axis=0))
 
 
-def _displaced(scene: Scene, size: int, sources: Callable[[Floats, float], Floats]) -> Scene:
-    """The scene as it appears in another view, whose points show what lies at ``sources`` in this one.
+@lru_cache(maxsize=8)
+def _sources(alignment: Alignment, size: int, rows: int, pixels: int, *, to_a: bool) -> sparse.csr_array:
+    """The matrix that displaces frames (rows, pixels), of a field of ``size`` fine pixels, between the views.
 
-    Points (2, …) are in fine pixels from the centre of a field of ``size``, and come with half of it. Beyond
-    its edge, the edge continues.
+    A point of the result shows what lies where ``alignment`` has it in the other view, arm A's if ``to_a``.
+    Beyond the edge, the edge continues.
     """
-    rows, cosines, pixels = scene.shape
     cell = size / np.array([[[rows]], [[pixels]]])
     centre = (np.array([[[rows]], [[pixels]]]) - 1) / 2
-    found = sources((np.indices((rows, pixels)) - centre) * cell, size / 2) / cell + centre
-    views = [map_coordinates(scene[:, k], found, order=1, mode="nearest") for k in range(cosines)]
-    return np.stack(views, axis=1)
+    points = (np.indices((rows, pixels)) - centre) * cell
+    found = (alignment.to_a if to_a else alignment.to_b)(points, size / 2) / cell + centre
+    return interpolation(*found).astype(np.float32)
+
+
+def _displaced(scene: Scene, size: int, alignment: Alignment, *, to_a: bool) -> Scene:
+    """A scene (row, cosine, pixel) as it appears in the view of the other arm; see `_sources`."""
+    rows, cosines, pixels = scene.shape
+    matrix = _sources(alignment, size, rows, pixels, to_a=to_a)
+    # one product for all cosines
+    flat = scene.transpose(0, 2, 1).reshape(rows * pixels, cosines)
+    return np.asarray((matrix @ flat).reshape(rows, pixels, cosines).transpose(0, 2, 1))
 
 
 AS_BUILT = Turn()
@@ -176,10 +187,8 @@ class LineModel:
         # Both are in arm A's axes, for the alignment: a displaced arm would otherwise seem early or late.
         a, b = views[0].scene(0), turn.to_a(views[1].scene(1))
         if self.alignment is not None:
-            a, b = (
-                _displaced(a, self._size, self.alignment.to_a),
-                _displaced(b, self._size, self.alignment.to_b),
-            )
+            a = _displaced(a, self._size, self.alignment, to_a=True)
+            b = _displaced(b, self._size, self.alignment, to_a=False)
         # What arm B saw predicts arm A, and the other way round.
         scenes = (b, turn.to_b(a))
         gain = [view.gain(arm, each) for arm, (view, each) in enumerate(zip(views, scenes, strict=True))]

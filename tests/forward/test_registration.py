@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scipy.ndimage import affine_transform
+from scipy.ndimage import affine_transform, map_coordinates
 
 from acquire.alignment import Alignment
 from acquire.arrays import Arrays, Dtype
 from acquire.errors import UsageError
-from acquire.forward import DualArm, Registration, hold_video, merge_video
+from acquire.forward import DualArm, Registration, hold_video, interpolation, merge_video
 from acquire.forward.registration import FEW, runs, sampling_matrix
 from acquire.geometry import Geometry
 from acquire.sim.effects.lens import LensDistortion
@@ -35,6 +35,14 @@ def test_it_interpolates_where_arm_b_looks(alignment: Alignment) -> None:
     offset = middle - back @ (middle + np.array([alignment.rows, alignment.columns]))
     expected = affine_transform(frame, back, offset, order=1, mode="nearest")
     seen = (sampling_matrix(alignment, n) @ frame.ravel()).reshape(n, n)
+    np.testing.assert_allclose(seen, expected, atol=1e-12)
+
+
+def test_oblong_frames_are_interpolated() -> None:
+    rng = np.random.default_rng(1)
+    frame, (rows, columns) = rng.random((9, 5)), rng.uniform(-1, 9, (2, 9, 5))
+    expected = map_coordinates(frame, [rows, columns], order=1, mode="nearest")
+    seen = (interpolation(rows, columns) @ frame.ravel()).reshape(9, 5)
     np.testing.assert_allclose(seen, expected, atol=1e-12)
 
 
