@@ -158,6 +158,8 @@ def _choose(bench: Workbench, volume: Trial, trials: int) -> Estimate:
     if repeats is not None and not clock.spent(SEARCH_SHARE):
         rival = min(at_a_glance, tried.best.error)
         cycle = bench.repeat(*repeats, rival)
+        if REPEATS * rival <= cycle.error < rival:
+            cycle = _or_turning(cycle, rival)
         tried.cycle = cycle if cycle.error < REPEATS * rival else None
     tried.followed = followed  # from now on: a cycle at rest competes with what is at rest
     ahead, refined = at_a_glance <= OUTDONE * tried.best.error, None
@@ -257,7 +259,9 @@ def _search(bench: Workbench, tried: _Tried, trials: int, rival: float) -> Trial
 
 def _best_volume(bench: Workbench, tried: _Tried, rival: float) -> Trial:
     """The best of volumes at rest, volumes that follow what moves, and cycles, each after a first trial."""
-    cycle = None if tried.cycle is None else _or_turning(tried.cycle, rival)
+    cycle = tried.cycle
+    if cycle is not None and not cycle.candidate.rotation:
+        cycle = _or_turning(cycle, rival)
     volume = tried.followed or cycle
     if volume is not None:
         return min(volume, cycle or volume, key=_error)
