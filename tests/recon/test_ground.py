@@ -102,6 +102,7 @@ def test_what_moves_before_a_textured_ground_leaves_it_its_detail(monkeypatch: p
     grounded = reconstruct(recorded.segment, 3, 1, error=False)
     assert grounded.parameters["ground"] > 0
     monkeypatch.setattr(choose, "GROUNDED", VOLUME)
+    monkeypatch.setattr(choose, "GROUND", 0.0)
     monkeypatch.setattr(Candidate, "with_ground", lambda *_, **__: None)
     without = reconstruct(recorded.segment, 3, 1, error=False)
     assert without.parameters["ground"] == 0
