@@ -34,7 +34,16 @@ from acquire.recon.blinking import (
     refine,
     solve_in_cosines,
 )
-from acquire.recon.candidates import CALM, COSINES, GROUND, GROUNDED, SMOOTH, STILL, VOLUME
+from acquire.recon.candidates import (
+    CALM,
+    COSINES,
+    GROUND,
+    GROUNDED,
+    PACE_STEP,
+    SMOOTH,
+    STILL,
+    VOLUME,
+)
 from acquire.recon.cycle import TRIED_CHANGES, find_period
 from acquire.recon.drift import drifting
 from acquire.recon.estimates import Preferred, Refined
@@ -309,19 +318,26 @@ def _on_path(at_rest: Trial, candidate: Candidate, rival: float) -> Trial:
 
 
 def _along(found: Trial, sides: float) -> Trial:
-    """A volume that follows what moves by so many ``sides``, on a better path and in enough cosines.
+    """A volume that follows what moves by so many ``sides``, on a better path, in enough cosines, and calmer.
 
     Weights are searched for later: those that suit a wrong path are wrong. A picture of n′ pixels that moves
     by v sides turns its finest wave v·n′/2 times, which takes v·n′ cosines. With fewer, a search finds calmer
-    volumes better, and never arrives there.
+    volumes better, and never arrives there. With enough, what is followed may be nearly at rest.
     """
     found = found.bench.follow_path(found)
     bench, finest = found.bench, sides * found.admm.theta.shape[1]
     count = min(next((each for each in COSINES if each >= finest), COSINES[-1]), bench.frames)
-    if count <= found.candidate.coefficients or bench.clock.spent(SEARCH_SHARE):
+    if count > found.candidate.coefficients:
+        found = _better(found, replace(found.candidate, coefficients=count))
+    calmer = found.candidate.with_pace(PACE_STEP)
+    return found if calmer is None else _better(found, calmer)
+
+
+def _better(found: Trial, candidate: Candidate) -> Trial:
+    """The better one of a trial and of a candidate that continues it, if there is time for it."""
+    if found.bench.clock.spent(SEARCH_SHARE):
         return found
-    wide = bench.attempt(replace(found.candidate, coefficients=count), NEXT_ITERATIONS, found)
-    return min(found, wide, key=_error)
+    return min(found, found.bench.attempt(candidate, NEXT_ITERATIONS, found), key=_error)
 
 
 def _worth_refining(bench: Workbench, cosines: InBand, best: Trial) -> bool:
