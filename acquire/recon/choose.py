@@ -318,18 +318,20 @@ def _on_path(at_rest: Trial, candidate: Candidate, rival: float) -> Trial:
 
 
 def _along(found: Trial, sides: float) -> Trial:
-    """A volume that follows what moves by so many ``sides``, on a better path, in enough cosines, and calmer.
+    """A volume that follows what moves by so many ``sides``, on a better path and in enough cosines.
 
     Weights are searched for later: those that suit a wrong path are wrong. A picture of n′ pixels that moves
     by v sides turns its finest wave v·n′/2 times, which takes v·n′ cosines. With fewer, a search finds calmer
-    volumes better, and never arrives there. With enough, what is followed may be nearly at rest.
+    volumes better, and never arrives there.
     """
     found = found.bench.follow_path(found)
     bench, finest = found.bench, sides * found.admm.theta.shape[1]
     count = min(next((each for each in COSINES if each >= finest), COSINES[-1]), bench.frames)
     if count > found.candidate.coefficients:
         found = _better(found, replace(found.candidate, coefficients=count))
-    calmer = found.candidate.with_pace(PACE_STEP)
+    # What is followed is often nearly at rest. A search arrives there after both weights, for which a budget
+    # may leave no time; without one, it does so by itself.
+    calmer = found.candidate.with_pace(PACE_STEP) if bench.clock.has_budget else None
     return found if calmer is None else _better(found, calmer)
 
 

@@ -78,6 +78,11 @@ class IterationClock:
         return time.process_time() - self._processor_began_s
 
     @property
+    def has_budget(self) -> bool:
+        """Whether time is limited."""
+        return self._budget_s is not None
+
+    @property
     def stop_requested(self) -> bool:
         """Whether the caller wants the answer now."""
         return self._stop is not None and self._stop.is_set()
