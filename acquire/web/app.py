@@ -126,6 +126,7 @@ def build_page(
 
     app = new_app(
         "The instrument's page: the daemon's API, recordings, videos and jobs.",
+        "the page's server",
         # Below /api, where the guard demands a token.
         openapi_url="/api/openapi.json",
         lifespan=lifespan,

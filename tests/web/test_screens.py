@@ -331,6 +331,9 @@ def test_a_refusal_is_shown_with_the_daemons_message(page: Page, instrument: Ins
     page.keyboard.press("a")
     page.locator("#error", has_text="camera b is not plugged in").wait_for(timeout=SEEN_MS)
     assert "try: plug it in" in page.inner_text("#error")
+    refused = page.request.get(f"{instrument.server.address}api/nothing").json()
+    assert refused["message"].startswith("the page's server cannot answer GET /api/nothing: ")
+    assert refused["possible"] == "/api/openapi.json"
 
 
 def test_a_key_without_effect_is_explained(browser: Browser, instrument: Instrument) -> None:
