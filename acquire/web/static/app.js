@@ -13,7 +13,7 @@ import { $ } from "./words.js";
 const SCREENS = ["watch", "aim", "recordings", "health", "setup"];
 const link = new Link(), band = new Band(), watch = new Watch(fail), aim = new Aim(), calibrate = new Calibrate(fail), recordings = new Recordings(fail);
 new Glimpse(link);
-let operator = false, setup = null, latest = null;
+let operator = false, setup = null, latest = null, run = null;
 
 function fail(text) { $("error").textContent = text; $("error").hidden = !text; }
 
@@ -56,6 +56,8 @@ link.addEventListener("news", ({ detail }) => {
 link.addEventListener("rows", ({ detail }) => { watch.rows(detail.header, detail.body); aim.rows(detail.header, detail.body); });
 link.addEventListener("state", ({ detail }) => {
   latest = detail.header.state;
+  // Arming makes the devices known that Setup shows.
+  if (run !== (run = latest.status.run_id) && !$("setup").hidden) screen();
   band.show(latest.status, latest.health, latest.for_s);
   watch.show(latest.status, latest.live_error);
   aim.show(latest.status, latest.live_error);
