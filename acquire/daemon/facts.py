@@ -112,6 +112,20 @@ class Setup(Message):
     )
 
 
+class LogEntry(Message):
+    """An entry of the daemon's log, in one line."""
+
+    time: datetime
+    level: Text = Field(description="info, warning, error, critical or debug")
+    text: Text
+
+
+class LogTail(Message):
+    """The latest entries of the daemon's log, newest last. What looks like a token is left out."""
+
+    entries: list[LogEntry]
+
+
 class ChangedKey(Message):
     """A key of the configuration with a new value after a reload of the file."""
 

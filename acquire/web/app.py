@@ -133,7 +133,7 @@ def build_page(
     )
     api = APIRouter(prefix="/api", responses=WHY_REFUSED)
     answers = Answers()
-    api.include_router(routes(Passing(hub), answers))
+    api.include_router(routes(Passing(hub, tokens), answers))
     _add_stream(api, OpenPages(hub))
     _add_recordings(api, archive, reading, answers)
     _add_jobs(api, jobs, answers)

@@ -9,6 +9,7 @@ import contextlib
 import os
 import re
 from collections.abc import Callable, Iterator
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -24,6 +25,7 @@ from acquire.daemon.endpoint import Endpoint
 from acquire.daemon.messages import DiskStatus
 from acquire.daemon.service import Service
 from acquire.errors import CameraError
+from acquire.logs import KeptEntry
 from acquire.stream.ring import RingShape
 
 if TYPE_CHECKING:
@@ -245,6 +247,33 @@ def test_the_reason_why_there_is_no_picture_is_shown_in_its_place(
     page.wait_for_selector("#aim-view p.none:has-text('No picture')", timeout=SEEN_MS)
     instrument.client.disarm()
     page.wait_for_selector("#aim-view p.none:has-text('No lines: arm the instrument')", timeout=SEEN_MS)
+
+
+def test_health_has_the_end_of_the_log(
+    page: Page, instrument: Instrument, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    texts = {"info": "idle → armed (arm)", "warning": "the disk is <b>slow</b>", "error": "start: refused"}
+    texts["debug"] = f"a viewer must not have {instrument.server.operator} of somebody's mark"
+    now = datetime.now(UTC)
+    entries = [KeptEntry(now, level, text) for level, text in texts.items()] * 12
+    monkeypatch.setattr("acquire.daemon.local.latest_entries", lambda: entries)
+    page.keyboard.press("4")
+    page.locator("#log li", has_text="! warning the disk is <b>slow</b>").first.wait_for(timeout=SEEN_MS)
+    assert page.locator("#log li", has_text="✗ error start: refused").count() == 12
+    assert page.locator("#log li").first.inner_text().endswith("a viewer must not have … of somebody's mark")
+    every_width(page, "health")
+
+
+def every_width(page: Page, name: str) -> None:
+    """Nothing reaches beyond the screen, in both themes."""
+    for theme in ("light", "dark"):
+        page.emulate_media(color_scheme=theme)  # type: ignore[arg-type]
+        for width in WIDTHS:
+            page.set_viewport_size({"width": width, "height": 900})
+            wide = page.evaluate("document.documentElement.scrollWidth")
+            assert wide <= width, f"{name} is {wide} px wide where {width} are to be had"
+            if SCREENSHOTS:
+                page.screenshot(path=Path(SCREENSHOTS) / f"{name}-{theme}-{width}.png", full_page=True)
 
 
 def test_all_can_be_reached_and_done_by_key(page: Page, instrument: Instrument) -> None:

@@ -5,13 +5,14 @@ import { Band } from "./band.js";
 import { Calibrate } from "./calibrate.js";
 import { showHealth, showSetup } from "./facts.js";
 import { Glimpse } from "./glimpse.js";
+import { LogTail } from "./health.js";
 import { Link, ask } from "./link.js";
 import { Recordings } from "./recordings.js";
 import { Watch } from "./watch.js";
 import { $ } from "./words.js";
 
 const SCREENS = ["watch", "aim", "recordings", "health", "setup"];
-const link = new Link(), band = new Band(), watch = new Watch(fail), aim = new Aim(), calibrate = new Calibrate(fail), recordings = new Recordings(fail);
+const link = new Link(), logTail = new LogTail(), band = new Band(), watch = new Watch(fail), aim = new Aim(), calibrate = new Calibrate(fail), recordings = new Recordings(fail);
 new Glimpse(link);
 let operator = false, setup = null, latest = null, run = null;
 
@@ -38,6 +39,7 @@ function screen() {
   const asked = location.hash.replace("#/", ""), shown = SCREENS.includes(asked) ? asked : "watch";
   for (const name of SCREENS) $(name).hidden = name !== shown;
   for (const anchor of document.querySelectorAll("nav a")) if (anchor.dataset.screen === shown) anchor.setAttribute("aria-current", "page"); else anchor.removeAttribute("aria-current");
+  if (shown === "health") logTail.show();
   if (shown === "recordings") recordings.show();
   if (shown === "aim" && setup) calibrate.open();
   if (shown === "setup") ask("GET", "setup").then((facts) => { setup = facts; showSetup(setup, latest?.status); }, (error) => fail(error.message));

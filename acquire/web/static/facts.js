@@ -14,7 +14,7 @@ export function showHealth(status, health, fail, operator) {
   if ($("health").hidden) return;
   const capacity = status.capacity;
   const key = JSON.stringify([health, capacity, status.processes, status.uploads, status.recoveries, status.troubles, status.state, operator]);
-  fill($("health"), key, () => [make("div", { className: "panels" },
+  fill($("facts"), key, () => [make("div", { className: "panels" },
     wide(panel("Checks against fixed thresholds", table(["check", "", "now", "thresholds"], health.checks.map((check) =>
       [check.name, make("span", { className: check.level }, MARKS[check.level]), check.text, check.limit])))),
     panel("What this host sustains", capacity
