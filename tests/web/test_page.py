@@ -65,6 +65,9 @@ def test_a_take_from_arming_to_the_video(page: Page, daemon: Daemon) -> None:
     devices = page.inner_text("#setup section[aria-label=Devices]")
     assert "sync trigger (model)\nfirmware " in devices, devices
     assert "at simulated trigger" in devices
+    page.keyboard.press("4")
+    page.locator("#latencies", has_text="s old").wait_for(timeout=SEEN_MS)
+    page.locator("#log li", has_text="idle → armed").wait_for(timeout=SEEN_MS)
     page.keyboard.press("1")
     page.fill("#pre", "0.2")
     page.keyboard.press("Tab")

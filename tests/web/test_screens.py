@@ -249,7 +249,7 @@ def test_the_reason_why_there_is_no_picture_is_shown_in_its_place(
     page.wait_for_selector("#aim-view p.none:has-text('No lines: arm the instrument')", timeout=SEEN_MS)
 
 
-def test_health_has_the_end_of_the_log(
+def test_health_has_latencies_and_the_end_of_the_log(
     page: Page, instrument: Instrument, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     texts = {"info": "idle → armed (arm)", "warning": "the disk is <b>slow</b>", "error": "start: refused"}
@@ -261,6 +261,14 @@ def test_health_has_the_end_of_the_log(
     page.locator("#log li", has_text="! warning the disk is <b>slow</b>").first.wait_for(timeout=SEEN_MS)
     assert page.locator("#log li", has_text="✗ error start: refused").count() == 12
     assert page.locator("#log li").first.inner_text().endswith("a viewer must not have … of somebody's mark")
+    latencies = page.locator("#latencies")
+    assert latencies.inner_text().count("– (not armed)") == 3
+    record(instrument)
+    instrument.see(
+        trigger={"clock_hz": 1, "uncertainty_ns": 1, "pulses": 9, "silent_s": 0.4}, path="/d/x.zarr"
+    )
+    found = re.compile(r"none has come yet.*[\d.]+.m?s ago; 10.000 recorded lines .*0\.4.s ago", re.DOTALL)
+    latencies.filter(has_text=found).wait_for(timeout=SEEN_MS)
     every_width(page, "health")
 
 

@@ -5,14 +5,14 @@ import { Band } from "./band.js";
 import { Calibrate } from "./calibrate.js";
 import { showHealth, showSetup } from "./facts.js";
 import { Glimpse } from "./glimpse.js";
-import { LogTail } from "./health.js";
+import { Latencies, LogTail } from "./health.js";
 import { Link, ask } from "./link.js";
 import { Recordings } from "./recordings.js";
 import { Watch } from "./watch.js";
 import { $ } from "./words.js";
 
 const SCREENS = ["watch", "aim", "recordings", "health", "setup"];
-const link = new Link(), logTail = new LogTail(), band = new Band(), watch = new Watch(fail), aim = new Aim(), calibrate = new Calibrate(fail), recordings = new Recordings(fail);
+const link = new Link(), logTail = new LogTail(), latencies = new Latencies(), band = new Band(), watch = new Watch(fail), aim = new Aim(), calibrate = new Calibrate(fail), recordings = new Recordings(fail);
 new Glimpse(link);
 let operator = false, setup = null, latest = null, run = null;
 
@@ -40,6 +40,7 @@ function screen() {
   for (const name of SCREENS) $(name).hidden = name !== shown;
   for (const anchor of document.querySelectorAll("nav a")) if (anchor.dataset.screen === shown) anchor.setAttribute("aria-current", "page"); else anchor.removeAttribute("aria-current");
   if (shown === "health") logTail.show();
+  if (latest) latencies.show(latest.status, latest.live_error);
   if (shown === "recordings") recordings.show();
   if (shown === "aim" && setup) calibrate.open();
   if (shown === "setup") ask("GET", "setup").then((facts) => { setup = facts; showSetup(setup, latest?.status); }, (error) => fail(error.message));
@@ -55,7 +56,7 @@ link.addEventListener("news", ({ detail }) => {
   watch.news(detail.header.news);
   if (detail.header.news.kind === "reload" && !$("setup").hidden) screen();
 });
-link.addEventListener("rows", ({ detail }) => { watch.rows(detail.header, detail.body); aim.rows(detail.header, detail.body); });
+link.addEventListener("rows", ({ detail }) => { watch.rows(detail.header, detail.body); aim.rows(detail.header, detail.body); latencies.rows(detail.header); });
 link.addEventListener("state", ({ detail }) => {
   latest = detail.header.state;
   // Arming makes the devices known that Setup shows.
@@ -64,6 +65,7 @@ link.addEventListener("state", ({ detail }) => {
   watch.show(latest.status, latest.live_error);
   aim.show(latest.status, latest.live_error);
   calibrate.show(latest.status);
+  latencies.show(latest.status, latest.live_error);
   showHealth(latest.status, latest.health, fail, operator);
   if (!setup) admitted().catch(() => {});
 });

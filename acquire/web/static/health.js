@@ -1,10 +1,41 @@
-// Health, beside the tables of checks: the end of the daemon's log.
+// Health, beside the tables of checks: latencies, and the end of the daemon's log.
 
 import { ask } from "./link.js";
-import { $, clock, fill, make } from "./words.js";
+import { $, clock, counted, duration, fill, make } from "./words.js";
 
 const EVERY_MS = 2000;
 const MARKS = { warning: ["warning", "! warning"], error: ["bad", "✗ error"], critical: ["bad", "✗ critical"] };
+
+/** How old the newest of everything is: lines by the pictures that come anyway, the rest by the daemon's status. */
+export class Latencies {
+  #arms = {}; #run = null;
+
+  rows(header) { this.#arms[header.arm] = performance.now() - header.age_ms; }
+
+  show(status, liveError) {
+    if (status.run_id !== this.#run) { this.#run = status.run_id; this.#arms = {}; }
+    if ($("health").hidden) return;
+    const facts = Object.keys(status.run_id ? status.arms : { a: 0, b: 0 }).map((arm) => [`newest line of arm ${arm.toUpperCase()}`, this.#line(arm, liveError)]);
+    facts.push(["newest lines on disk", onDisk(status)]);
+    facts.push(["last message of the trigger", status.trigger ? `${age(status.trigger.silent_s)} ago` : "– (not armed)"]);
+    fill($("latencies"), JSON.stringify(facts), () => facts.flatMap(([term, text]) => [make("dt", {}, term), make("dd", {}, text)]));
+  }
+
+  #line(arm, liveError) {
+    if (this.#run === null) return "– (not armed)";
+    if (liveError) return "unknown: the lines cannot be read";
+    return arm in this.#arms ? `${age((performance.now() - this.#arms[arm]) / 1000)} old` : "none has come yet";
+  }
+}
+
+const age = (seconds) => duration(seconds < 0.1 ? Math.max(1, Math.round(1000 * seconds)) / 1000 : seconds);
+
+function onDisk({ recording, arms }) {
+  if (!recording) return "– (nothing is being recorded)";
+  const left = recording.recorded_lines - recording.committed_lines, rate = Math.min(...Object.values(arms).map((arm) => arm.rate_hz));
+  const behind = left > 0 && rate > 0 ? ` (${age(left / rate)})` : "";
+  return `${recording.commit_age_s === null ? "none yet" : `${age(recording.commit_age_s)} ago`}; ${counted(left, "recorded line")}${behind} not readable yet`;
+}
 
 /** Asks while the screen is shown, and only then. */
 export class LogTail {
