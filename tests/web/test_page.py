@@ -68,6 +68,10 @@ def test_a_take_from_arming_to_the_video(page: Page, daemon: Daemon) -> None:
     page.keyboard.press("4")
     page.locator("#latencies", has_text="s old").wait_for(timeout=SEEN_MS)
     page.locator("#log li", has_text="idle → armed").wait_for(timeout=SEEN_MS)
+    page.click("#examine")
+    page.locator("#findings tr", has_text="acquire 0.1.0 is running").wait_for(timeout=SEEN_MS)
+    assert not page.get_by_role("cell", name="camera a", exact=True).count(), "no device is opened"
+    page.wait_for_selector("#examine:enabled", timeout=SEEN_MS)
     page.keyboard.press("1")
     page.fill("#pre", "0.2")
     page.keyboard.press("Tab")

@@ -418,6 +418,7 @@ def test_a_viewer_may_look_and_a_stranger_must_log_in(browser: Browser, instrume
         page.wait_for_selector("#enter:not([open])", state="attached", timeout=SEEN_MS)
         page.wait_for_selector("body[data-state=idle]", timeout=SEEN_MS)
         assert page.is_disabled("#arm")
+        assert page.is_disabled("#examine")
         page.keyboard.press("a")
         page.locator("#error", has_text="logged in as a viewer").wait_for(timeout=SEEN_MS)
         assert instrument.server.viewer not in page.url

@@ -5,14 +5,14 @@ import { Band } from "./band.js";
 import { Calibrate } from "./calibrate.js";
 import { showHealth, showSetup } from "./facts.js";
 import { Glimpse } from "./glimpse.js";
-import { Latencies, LogTail } from "./health.js";
+import { Checkup, Latencies, LogTail } from "./health.js";
 import { Link, ask } from "./link.js";
 import { Recordings } from "./recordings.js";
 import { Watch } from "./watch.js";
 import { $ } from "./words.js";
 
 const SCREENS = ["watch", "aim", "recordings", "health", "setup"];
-const link = new Link(), logTail = new LogTail(), latencies = new Latencies(), band = new Band(), watch = new Watch(fail), aim = new Aim(), calibrate = new Calibrate(fail), recordings = new Recordings(fail);
+const link = new Link(), logTail = new LogTail(), latencies = new Latencies(), checkup = new Checkup(fail), band = new Band(), watch = new Watch(fail), aim = new Aim(), calibrate = new Calibrate(fail), recordings = new Recordings(fail);
 new Glimpse(link);
 let operator = false, setup = null, latest = null, run = null;
 
@@ -29,7 +29,7 @@ async function admitted() {
   const { role } = await ask("GET", "whoami");
   operator = role === "operator";
   await ask("GET", "setup").then((facts) => { setup = facts; }, () => {});
-  watch.enter(operator, setup); recordings.enter(operator); calibrate.enter(operator);
+  watch.enter(operator, setup); recordings.enter(operator); calibrate.enter(operator); checkup.enter(operator);
   $("enter").close();
   screen();
 }
@@ -39,7 +39,7 @@ function screen() {
   const asked = location.hash.replace("#/", ""), shown = SCREENS.includes(asked) ? asked : "watch";
   for (const name of SCREENS) $(name).hidden = name !== shown;
   for (const anchor of document.querySelectorAll("nav a")) if (anchor.dataset.screen === shown) anchor.setAttribute("aria-current", "page"); else anchor.removeAttribute("aria-current");
-  if (shown === "health") logTail.show();
+  if (shown === "health") { logTail.show(); if (setup) checkup.show(); }
   if (latest) latencies.show(latest.status, latest.live_error);
   if (shown === "recordings") recordings.show();
   if (shown === "aim" && setup) calibrate.open();

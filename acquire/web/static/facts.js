@@ -3,12 +3,12 @@
 import { ask } from "./link.js";
 import { $, clock, count, duration, fill, make, quantity } from "./words.js";
 
-const table = (titles, rows) => make("div", { className: "scroll" }, make("table", {},
+export const table = (titles, rows) => make("div", { className: "scroll" }, make("table", {},
   make("tr", {}, ...titles.map((title) => make("th", { scope: "col" }, title))),
   ...rows.map((cells) => make("tr", {}, ...cells.map((cell) => make("td", {}, cell))))));
 const panel = (title, ...children) => make("section", { className: "panel", "aria-label": title }, make("h2", {}, title), ...children);
 const wide = (section) => { section.classList.add("whole"); return section; };
-const MARKS = { good: "✓ good", unknown: "· unknown", warning: "! warning", bad: "✗ bad" };
+export const MARKS = { good: "✓ good", unknown: "· unknown", warning: "! warning", bad: "✗ bad" };
 
 export function showHealth(status, health, fail, operator) {
   if ($("health").hidden) return;
@@ -46,5 +46,5 @@ export function showSetup(setup, status) {
     panel("Devices", ...devices(setup.devices)),
     panel("Versions", table(["library", "version"], Object.entries(setup.versions))),
     panel("Lines", table(["", ""], [["rate", quantity(setup.line_rate_hz, "lines/s")], ["period set by the trigger", quantity(setup.line_period_ns / 1e9, "s")], ["the rings hold", duration(setup.history_s)]])),
-    panel("Complete configuration", make("pre", { tabIndex: 0 }, JSON.stringify(setup.config, null, 2))))]);
+    wide(panel("Complete configuration", make("pre", { tabIndex: 0 }, JSON.stringify(setup.config, null, 2)))))]);
 }

@@ -1,10 +1,11 @@
-// Health, beside the tables of checks: latencies, and the end of the daemon's log.
+// Health, beside the tables of checks: latencies, the examination of the host, and the end of the daemon's log.
 
+import { MARKS, table } from "./facts.js";
 import { ask } from "./link.js";
 import { $, clock, counted, duration, fill, make } from "./words.js";
 
 const EVERY_MS = 2000;
-const MARKS = { warning: ["warning", "! warning"], error: ["bad", "✗ error"], critical: ["bad", "✗ critical"] };
+const LOG_MARKS = { warning: ["warning", "! warning"], error: ["bad", "✗ error"], critical: ["bad", "✗ critical"] };
 
 /** How old the newest of everything is: lines by the pictures that come anyway, the rest by the daemon's status. */
 export class Latencies {
@@ -37,6 +38,39 @@ function onDisk({ recording, arms }) {
   return `${recording.commit_age_s === null ? "none yet" : `${age(recording.commit_age_s)} ago`}; ${counted(left, "recorded line")}${behind} not readable yet`;
 }
 
+/** The findings of the latest examination, for everybody; only an operator can ask for another. */
+export class Checkup {
+  #fail; #operator = false; #running = false;
+
+  constructor(fail) { this.#fail = fail; $("examine").onclick = () => this.#examine(); }
+
+  enter(operator) { this.#operator = operator; this.#enable(); }
+
+  async show() {
+    try { this.#list(await ask("GET", "doctor")); }
+    catch (error) { this.#fail(error.message); }
+  }
+
+  async #examine() {
+    this.#fail("");
+    this.#running = true; this.#enable();
+    $("examined").textContent = "Examining …";
+    try { this.#list(await ask("POST", "doctor")); }
+    catch (error) { $("examined").textContent = ""; this.#fail(error.message); }
+    finally { this.#running = false; this.#enable(); }
+  }
+
+  #enable() { $("examine").disabled = !this.#operator || this.#running; }
+
+  #list({ examined, running, findings }) {
+    const bad = findings.filter((one) => one.level !== "good").length;
+    $("examined").textContent = running || this.#running && !examined ? "Examining …" : !examined ? "Not examined since the page started."
+      : `${new Date(examined).toLocaleString("en-GB")}: ${bad ? `${bad} of ${counted(findings.length, "finding")} ${bad === 1 ? "is" : "are"} not good` : "all is good"}.`;
+    fill($("findings"), JSON.stringify(findings), () => findings.length ? [table(["check", "", "result", "what to do"], findings.map((one) =>
+      [one.name, make("span", { className: one.level }, MARKS[one.level]), one.text, one.level === "good" ? "" : one.todo]))] : []);
+  }
+}
+
 /** Asks while the screen is shown, and only then. */
 export class LogTail {
   #asking = false;
@@ -53,7 +87,7 @@ export class LogTail {
 
   #list(entries) {
     fill($("log"), JSON.stringify(entries), () => entries.length ? entries.toReversed().map((entry) => {
-      const [level, mark] = MARKS[entry.level] ?? ["", ""];
+      const [level, mark] = LOG_MARKS[entry.level] ?? ["", ""];
       return make("li", {}, entry.time ? make("time", { dateTime: entry.time }, clock(entry.time)) : null, mark ? make("b", { className: level }, `${mark} `) : null, entry.text);
     }) : [make("li", {}, "Nothing yet.")]);
   }
