@@ -245,6 +245,7 @@ def test_the_reason_why_there_is_no_picture_is_shown_in_its_place(
     assert "run as the daemon's user" in words
     page.goto(page.url.partition("#")[0] + "#/aim")
     page.wait_for_selector("#aim-view p.none:has-text('No picture')", timeout=SEEN_MS)
+    assert "brightest value of each pixel, in\u00a0% of white" in page.inner_text("#aim-view .axis")
     instrument.client.disarm()
     page.wait_for_selector("#aim-view p.none:has-text('No lines: arm the instrument')", timeout=SEEN_MS)
 
