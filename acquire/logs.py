@@ -14,9 +14,11 @@ import json
 import logging
 import os
 import queue
+import re
 import sys
 import threading
 import time
+from collections import deque
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING
@@ -43,6 +45,13 @@ MOST_WAITING = 1000
 """Entries that wait to be written."""
 FLUSH_S = 1.0
 """Time for the waiting entries at the end of the process."""
+
+MOST_KEPT = 50
+"""Latest entries that are kept, for who cannot read the log itself."""
+MOST_KEPT_CHARACTERS = 500
+"""Upper limit on the length of each."""
+# None is ever logged, but whoever pastes the page's address into a mark gives away what is in it.
+_SECRET = re.compile(r"(\btoken\b['\"]?\s*[=:]\s*['\"]?|\bbearer\s+)[\w.~+/-]+", re.IGNORECASE)
 
 Kind = tuple[str, int, str]
 """Logger, level and message before its arguments are formatted."""
@@ -99,6 +108,24 @@ class _Count:
     seen: int = 0
 
 
+@dataclass(frozen=True, slots=True)
+class KeptEntry:
+    """An entry of the log, with neither a traceback nor anything that looks like a token."""
+
+    time: datetime
+    level: str
+    text: str
+
+    @classmethod
+    def of(cls, record: logging.LogRecord) -> KeptEntry:
+        text = _SECRET.sub(r"\1…", visible(record.getMessage()))
+        if record.exc_info and record.exc_info[0] is not None:
+            text = f"{text} ({record.exc_info[0].__name__}, with a traceback)"
+        if len(text) > MOST_KEPT_CHARACTERS:
+            text = f"{text[:MOST_KEPT_CHARACTERS]}…"
+        return cls(datetime.fromtimestamp(record.created, UTC), record.levelname.lower(), text)
+
+
 class Bounded(logging.Filter):
     """Passes `REPEATS` (or `FACTS`) entries of a kind per `WINDOW_S`, then reports how many it suppressed."""
 
@@ -135,15 +162,22 @@ class Aside(logging.Handler):
         self._file = file
         self._waiting: queue.SimpleQueue[str | threading.Event] = queue.SimpleQueue()
         self._lost = 0
+        self._kept: deque[KeptEntry] = deque(maxlen=MOST_KEPT)
         # A daemon thread: it may be blocked for as long as nothing reads the log.
         threading.Thread(target=self._write, name="log", daemon=True).start()
 
     def emit(self, record: logging.LogRecord) -> None:
         """Hand the entry to the thread; if too many wait already, it is counted as lost."""
+        self._kept.append(KeptEntry.of(record))
         if self._waiting.qsize() < MOST_WAITING:
             self._waiting.put(self.format(record))
         else:
             self._lost += 1
+
+    @property
+    def kept(self) -> list[KeptEntry]:
+        """The latest entries, newest last, whether or not anything has accepted them."""
+        return list(self._kept.copy())  # at once: another thread may append meanwhile
 
     def flush(self) -> None:
         """Wait until the entries so far are written, for at most `FLUSH_S`."""
@@ -188,6 +222,11 @@ def write_log(level: int) -> None:
     # `emit` bypasses the filter, which would otherwise count its own entries.
     handler.addFilter(Bounded(lambda text: handler.emit(_entry(text))))
     logging.basicConfig(level=level, handlers=[handler])
+
+
+def latest_entries() -> list[KeptEntry]:
+    """Return the latest entries of this process's log, newest last; none without `write_log`."""
+    return [entry for one in logging.getLogger().handlers if isinstance(one, Aside) for entry in one.kept]
 
 
 def _entry(text: str) -> logging.LogRecord:

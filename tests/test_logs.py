@@ -7,7 +7,21 @@ import logging
 import subprocess
 import sys
 
-from acquire.logs import EACH, FACTS, MOST_CHARACTERS, MOST_WAITING, REPEATS, WINDOW_S, Bounded, OneLine
+import pytest
+
+from acquire.logs import (
+    EACH,
+    FACTS,
+    MOST_CHARACTERS,
+    MOST_KEPT,
+    MOST_KEPT_CHARACTERS,
+    MOST_WAITING,
+    REPEATS,
+    WINDOW_S,
+    Bounded,
+    KeptEntry,
+    OneLine,
+)
 
 
 def record(text: str, *words: object, level: int = logging.INFO) -> logging.LogRecord:
@@ -55,6 +69,51 @@ def test_entries_about_recordings_are_no_repetitions() -> None:
     for entry in entries:
         entry.__dict__.update(EACH)
     assert [bounded.filter(entry) for entry in entries] == [True] * FACTS + [False]
+
+
+def test_the_latest_entries_are_kept_and_bounded() -> None:
+    """As many as are written: those that repeat others are only counted."""
+    code = (
+        "import json, logging\n"
+        "from acquire.logs import latest_entries, write_log\n"
+        "assert latest_entries() == []\n"
+        "write_log(logging.INFO); log = logging.getLogger('acquire.daemon')\n"
+        "for number in range(150): log.warning(f'entry {number}: %s', 'x' * 10**4)\n"
+        "for _ in range(150): log.info('again')\n"
+        "print(json.dumps([(one.level, one.text) for one in latest_entries()]))\n"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, timeout=300, check=True
+    )
+    kept = json.loads(done.stdout)
+    assert len(kept) == MOST_KEPT
+    assert kept[-REPEATS:] == [["info", "again"]] * REPEATS
+    others = kept[:-REPEATS]
+    first = 150 - len(others)
+    assert [text.split(":")[0] for _, text in others] == [f"entry {number}" for number in range(first, 150)]
+    assert {(level, len(text)) for level, text in others} == {("warning", MOST_KEPT_CHARACTERS + 1)}
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "mark: http://host:8300/#token=SECRET-_1",
+        "{'token': 'SECRET-_1'}",
+        "Authorization: Bearer SECRET-_1",
+        "ACQUIRE token: SECRET-_1 of the operator",
+    ],
+)
+def test_what_looks_like_a_token_is_not_kept(text: str) -> None:
+    kept = KeptEntry.of(record("event: %s", text)).text
+    assert "SECRET" not in kept
+    assert "…" in kept
+
+
+def test_a_kept_entry_is_one_line_and_names_its_error() -> None:
+    entry = record("failed\nERROR forged")
+    entry.exc_info = (ValueError, ValueError("a"), None)
+    assert KeptEntry.of(entry).text == r"failed\nERROR forged (ValueError, with a traceback)"
+    assert KeptEntry.of(record("the token file was changed")).text == "the token file was changed"
 
 
 def test_the_number_of_kinds_is_bounded() -> None:

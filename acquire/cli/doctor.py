@@ -11,10 +11,11 @@ import typer
 from acquire.cli.completion import rigs
 from acquire.cli.control import SocketOption
 from acquire.cli.output import JsonFlag, print_json, print_table, say
-from acquire.errors import AcquireError, DeviceError
+from acquire.errors import AcquireError, DeviceError, UsageError
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
+    from pathlib import Path
 
     from acquire.daemon.doctor import CheckResult
 
@@ -37,27 +38,24 @@ def doctor(
             help="Rig file, to also check its devices and requirements. Default: check the host only.",
         ),
     ] = None,
+    running: Annotated[
+        bool,
+        typer.Option(
+            "--running",
+            help="Check the host by the setup of the daemon that is running; also while it records.",
+        ),
+    ] = False,
     socket: SocketOption = None,
     json: JsonFlag = False,
 ) -> None:
     """Check kernel limits, disk, memory, real-time rights, clock, devices, ports and versions.
 
     The command advises what to do about each problem and changes nothing. It opens the devices of the rig,
-    unless a daemon is running. The exit code is 5 if a check fails.
+    unless a daemon is running, and none with --running. The exit code is 5 if a check fails.
 
     Example: [bold]acquire doctor --config rig-demo[/]
     """
-    from acquire.client import Client
-    from acquire.config import load_rig
-    from acquire.daemon.doctor import examine
-
-    rig = None if config is None else load_rig(config)
-    running: str | None = None  # version of the daemon that is running
-    with suppress(AcquireError):
-        # At the rig's own socket: a daemon of another rig elsewhere does not concern it.
-        running = Client(socket or (rig.control.socket if rig else None)).status().version
-    # A daemon that is running has the devices open, and may be recording.
-    findings = [*examine(rig, running), *(_devices(config) if config and running is None else ())]
+    findings = _of_daemon(config, socket) if running else _of_rig(config, socket)
     if json:
         print_json([asdict(one) for one in findings])
     else:
@@ -68,6 +66,30 @@ def doctor(
                 say(f"{one.name}: {one.todo}")
     if any(one.level == "bad" for one in findings):
         raise typer.Exit(DeviceError.exit_code)
+
+
+def _of_daemon(config: str | None, socket: Path | None) -> list[CheckResult]:
+    from acquire.client import Client
+    from acquire.daemon.checkup import examine_running
+
+    if config is not None:
+        raise UsageError("--config and --running exclude each other", hint="one of them")
+    client = Client(socket)
+    return list(examine_running(client.setup(), client.status()))
+
+
+def _of_rig(config: str | None, socket: Path | None) -> list[CheckResult]:
+    from acquire.client import Client
+    from acquire.config import load_rig
+    from acquire.daemon.doctor import examine
+
+    rig = None if config is None else load_rig(config)
+    running: str | None = None  # version of the daemon that is running
+    with suppress(AcquireError):
+        # At the rig's own socket: a daemon of another rig elsewhere does not concern it.
+        running = Client(socket or (rig.control.socket if rig else None)).status().version
+    # A daemon that is running has the devices open, and may be recording.
+    return [*examine(rig, running), *(_devices(config) if config and running is None else ())]
 
 
 def _devices(config: str) -> Iterator[CheckResult]:

@@ -13,7 +13,7 @@ from pydantic import BaseModel
 
 from acquire.client import core
 from acquire.client.core import ApiCall, EventReader, Target
-from acquire.daemon.facts import Health, News, Reloaded, Rings, Setup, Version
+from acquire.daemon.facts import Health, LogTail, News, Reloaded, Rings, Setup, Version
 from acquire.daemon.messages import ArmRequest, CapacityStatus, StartRequest, Status
 from acquire.daemon.options import ArmOptions, StartOptions
 from acquire.daemon.peer import connect
@@ -99,6 +99,9 @@ class AsyncClient:
 
     async def rings(self) -> Rings:
         return await self.call(core.fact("rings", Rings))
+
+    async def log(self) -> LogTail:
+        return await self.call(core.fact("log", LogTail))
 
     async def events(self, last_id: str | None = None, *, history: bool = False) -> AsyncIterator[News]:
         """Yield news as it happens. A broken connection is made again, and no news is missed.

@@ -14,7 +14,7 @@ from pydantic import BaseModel
 
 from acquire.client import core
 from acquire.client.core import ApiCall, EventReader, Target
-from acquire.daemon.facts import Health, News, Reloaded, Rings, Setup, Version
+from acquire.daemon.facts import Health, LogTail, News, Reloaded, Rings, Setup, Version
 from acquire.daemon.messages import ArmRequest, CapacityStatus, StartRequest, Status
 from acquire.daemon.options import ArmOptions, StartOptions
 from acquire.daemon.peer import connect
@@ -145,6 +145,10 @@ class Client:
     def rings(self) -> Rings:
         """Return the shared memory of the rings, for `acquire.stream.peek` on the same host."""
         return self._do(core.fact("rings", Rings))
+
+    def log(self) -> LogTail:
+        """Return the latest entries of the daemon's log, newest last."""
+        return self._do(core.fact("log", LogTail))
 
     def open(self, path: Path | str | None = None) -> Recording:
         """Open a recording on this host: the one at ``path``, the one being written, or the latest.

@@ -47,8 +47,11 @@ def build_app(api: Api) -> FastAPI:
     return app
 
 
-def new_app(description: str, **options: Any) -> FastAPI:
-    """Return an API without routes, with error handlers and a limit for the body."""
+def new_app(description: str, speaker: str = "the daemon", **options: Any) -> FastAPI:
+    """Return an API without routes, with error handlers and a limit for the body.
+
+    ``speaker`` is the process that answers, as its own refusals and defects name it.
+    """
     app = FastAPI(
         title="acquire",
         version=__version__,
@@ -63,7 +66,7 @@ def new_app(description: str, **options: Any) -> FastAPI:
     )
     app.add_middleware(BoundedBody)
     app.add_middleware(HeadAsGet)
-    _add_errors(app)
+    _add_errors(app, speaker)
     return app
 
 
@@ -119,7 +122,9 @@ class HeadAsGet:
             await answering
 
 
-def _add_errors(app: FastAPI) -> None:
+def _add_errors(app: FastAPI, speaker: str) -> None:
+    described = str(app.openapi_url)
+
     @app.exception_handler(AcquireError)
     async def refused(_: Request, error: AcquireError) -> JSONResponse:
         return _answer(error)
@@ -134,22 +139,22 @@ def _add_errors(app: FastAPI) -> None:
             why = shortened(own_words(item["msg"]), 400)
             explained.append(f"{shortened(key)} = {shown(item.get('input'))}: {why}")
         more = [f"and {len(found) - MOST_EXPLAINED} more"] if len(found) > MOST_EXPLAINED else []
-        return _answer(UsageError("; ".join(explained + more), possible="/openapi.json"))
+        return _answer(UsageError("; ".join(explained + more), possible=described))
 
     @app.exception_handler(HTTPException)
     async def unknown(request: Request, error: HTTPException) -> JSONResponse:
         asked = shortened(f"{request.method} {request.url.path}")
         # In our own form, so that a client shows every refusal alike.
         refusal = UsageError(
-            f"the daemon cannot answer {asked}: {shortened(error.detail)}", possible="/openapi.json"
+            f"{speaker} cannot answer {asked}: {shortened(error.detail)}", possible=described
         )
         return JSONResponse(error_body(refusal), error.status_code, error.headers)
 
     @app.exception_handler(Exception)
     async def defect(_: Request, error: Exception) -> JSONResponse:
         # The server logs the traceback; the user gets one line that refers to it.
-        text = f"defect in the daemon: {shortened(repr(error), 400)}"
-        return _answer(AcquireError(text, hint="see the daemon's log"))
+        text = f"defect in {speaker}: {shortened(repr(error), 400)}"
+        return _answer(AcquireError(text, hint="see its log"))
 
 
 def _answer(error: AcquireError) -> JSONResponse:

@@ -57,10 +57,10 @@ class CheckResult:
     todo: str = ""
 
 
-def examine(rig: RigConfig | None, running: str | None) -> Iterator[CheckResult]:
+def examine(rig: RigConfig | None, running: str | None, *, has_rings: bool = False) -> Iterator[CheckResult]:
     """Yield all findings about the host; devices are examined elsewhere.
 
-    ``running`` is the version of the daemon that runs here, if any.
+    ``running`` is the version of the daemon that runs here, if any; ``has_rings``: its run is armed.
     """
     text = f"acquire {__version__} on Python {sys.version.split()[0]}, numpy {np.__version__}"
     yield CheckResult("versions", "good", text)
@@ -76,7 +76,7 @@ def examine(rig: RigConfig | None, running: str | None) -> Iterator[CheckResult]
     yield _governor()
     yield _realtime(rig)
     yield _sessions(rig)
-    yield _memory(rig)
+    yield _memory(None if has_rings else rig)
     yield from _disk(Path() if rig is None else rig.recording.directory)
     if rig is not None and shares_disk(rig.recording.upload_to, rig.recording.directory.absolute()):
         yield CheckResult(

@@ -82,6 +82,18 @@ class Version(Message):
     python: str
 
 
+class DeviceFacts(Message):
+    """A device of the rig, as it described itself when it was armed last; empty: it does not say."""
+
+    device: str = Field(description="trigger, camera a or camera b")
+    model: Text = ""
+    vendor: Text = ""
+    serial: Text = ""
+    firmware: Text = ""
+    board: Text = Field(default="", description="of a trigger with this project's gateware")
+    port: Text = Field(default="", description="where the trigger is connected")
+
+
 class Setup(Message):
     """The resolved configuration, and how it differs from the defaults."""
 
@@ -95,6 +107,23 @@ class Setup(Message):
     black_dn: dict[str, float]
     history_s: float = Field(description="seconds of past lines that the rings hold")
     versions: dict[str, str] = Field(description="versions of the libraries between camera and disk")
+    devices: list[DeviceFacts] = Field(
+        default=[], description="as armed last; empty: not since the daemon started"
+    )
+
+
+class LogEntry(Message):
+    """An entry of the daemon's log, in one line."""
+
+    time: datetime
+    level: Text = Field(description="info, warning, error, critical or debug")
+    text: Text
+
+
+class LogTail(Message):
+    """The latest entries of the daemon's log, newest last. What looks like a token is left out."""
+
+    entries: list[LogEntry]
 
 
 class ChangedKey(Message):

@@ -9,8 +9,11 @@ from __future__ import annotations
 import asyncio
 import time
 from collections.abc import Awaitable, Callable
+from dataclasses import asdict
 from typing import TYPE_CHECKING
 
+from acquire.daemon.devices import KnownDevices
+from acquire.daemon.facts import LogEntry, LogTail
 from acquire.daemon.health import health_of
 from acquire.daemon.messages import fault_error
 from acquire.daemon.setup import rings_of, setup_of, version_of
@@ -18,6 +21,7 @@ from acquire.daemon.states import State
 from acquire.daemon.stream import Streams
 from acquire.daemon.who import WHO
 from acquire.errors import UsageError
+from acquire.logs import latest_entries
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
@@ -35,10 +39,17 @@ Run = Callable[[Callable[[], None]], Awaitable[None]]
 class Local:
     """See the module; the methods are those of `acquire.daemon.routes.Api`."""
 
-    def __init__(self, service: Service, run: Run, reloading: Reloading | None = None) -> None:
+    def __init__(
+        self,
+        service: Service,
+        run: Run,
+        reloading: Reloading | None = None,
+        devices: KnownDevices | None = None,
+    ) -> None:
         self._service = service
         self._run = run
         self._reloading = reloading
+        self._devices = devices or KnownDevices()
         self._streams = Streams(service.news, service.status)
 
     async def status(self) -> Status:
@@ -93,7 +104,10 @@ class Local:
         return version_of(self._service.config)
 
     async def setup(self) -> Setup:
-        return setup_of(self._service.config, self._service.origin)
+        return setup_of(self._service.config, self._service.origin, self._devices.facts)
+
+    async def log(self) -> LogTail:
+        return LogTail(entries=[LogEntry(**asdict(one)) for one in latest_entries()])
 
     async def rings(self) -> Rings:
         return rings_of(self._service)

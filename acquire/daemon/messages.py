@@ -233,6 +233,10 @@ class RecordingStatus(Message):
     beyond_bytes: int = Field(
         default=0, description="bytes above recording.retention.max_gb, which are kept because lines are held"
     )
+    commit_age_s: float | None = Field(
+        default=None,
+        description="seconds since lines last became readable, looked at five times a second; null: none yet",
+    )
 
 
 class LastRecording(Message):

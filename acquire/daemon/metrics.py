@@ -110,6 +110,9 @@ class _Metrics(Collector):
         if (now := status.recording) is not None:
             waiting = now.recorded_lines - now.committed_lines
             yield _gauge("acquire_uncommitted_lines", "Lines not readable yet.", [((), waiting)])
+            if now.commit_age_s is not None:
+                age = [((), now.commit_age_s)]
+                yield _gauge("acquire_commit_age_seconds", "Time since lines last became readable.", age)
             yield _gauge(
                 "acquire_held_beyond_limit_bytes",
                 "Bytes above recording.retention.max_gb that are kept because lines are held.",

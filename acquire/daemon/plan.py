@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from acquire.calibrate.choose import carried_calibration
 from acquire.config import ConstantCodeConfig
+from acquire.daemon.devices import KnownDevices
 from acquire.daemon.events import budget_lines, window_of
 from acquire.daemon.messages import CalibrationStatus
 from acquire.daemon.storage import choose_for, storage_settings
@@ -35,9 +36,15 @@ class Run:
     """One run of a rig: armed once, any number of recordings, closed once."""
 
     def __init__(
-        self, config: RigConfig, rig: Rig, choose: Callable[[RigConfig], CodecChoice] = choose_for
+        self,
+        config: RigConfig,
+        rig: Rig,
+        choose: Callable[[RigConfig], CodecChoice] = choose_for,
+        devices: KnownDevices | None = None,
     ) -> None:
         """Prepare a run without touching a device; ``choose`` finds the codec if that is ``auto``.
+
+        ``devices`` are told of those that were armed.
 
         Raises UsageError for a configuration, or calibration, that cannot work.
         """
@@ -45,6 +52,7 @@ class Run:
         self._config = config
         self._rig = rig
         self._choose = choose
+        self._devices = devices or KnownDevices()
         self._choice: CodecChoice | None = None
         self._calibration = carried_calibration(config, rig.layout)
         self.capture = Capture(capture_plan(config, rig, self.run_id), rig.trigger)
@@ -65,6 +73,7 @@ class Run:
         if self._config.recording.codec == "auto":
             self._choice = self._choose(self._config)
         self.capture.arm(self._config.stream.arm_timeout_s, progress)
+        self._devices.note(self._rig.trigger, self.capture.cameras)
 
     def adopt(self, recording: RecordingConfig) -> None:
         """Use the settings ``recording`` for the next recording."""

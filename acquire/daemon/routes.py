@@ -12,7 +12,7 @@ from fastapi import APIRouter, Depends, Header, Query, Response
 from fastapi.responses import StreamingResponse
 
 from acquire.daemon.answers import Answers
-from acquire.daemon.facts import Health, Reloaded, Rings, Setup, Version
+from acquire.daemon.facts import Health, LogTail, Reloaded, Rings, Setup, Version
 from acquire.daemon.messages import (
     LONGEST_ID,
     ArmRequest,
@@ -64,6 +64,7 @@ class Api(Protocol):
     async def version(self) -> Version: ...
     async def setup(self) -> Setup: ...
     async def rings(self) -> Rings: ...
+    async def log(self) -> LogTail: ...
     def events(self, last_id: str | None, status_s: float | None, *, history: bool) -> AsyncIterator[str]: ...
 
 
@@ -83,6 +84,7 @@ def routes(api: Api, answers: Answers) -> APIRouter:
     router = APIRouter(dependencies=[Depends(_note_who)])
     _add_commands(router, api, answers)
     _add_facts(router, api)
+    _add_judgements(router, api)
     return router
 
 
@@ -125,10 +127,6 @@ def _add_facts(router: APIRouter, api: Api) -> None:
     async def status() -> Status:
         return await api.status()
 
-    @router.get("/health", summary="Is all well? One word, one sentence, and the checks behind them")
-    async def health() -> Health:
-        return await api.health()
-
     @router.get("/version", summary="Identity of the daemon")
     async def version() -> Version:
         return await api.version()
@@ -140,6 +138,10 @@ def _add_facts(router: APIRouter, api: Api) -> None:
     @router.get("/rings", summary="Memory through which the lines pass, for observers on this host")
     async def rings() -> Rings:
         return await api.rings()
+
+    @router.get("/log", summary="Latest entries of the daemon's log")
+    async def log() -> LogTail:
+        return await api.log()
 
     @router.get("/events", summary="What happens, as it happens", responses=STREAM, response_class=Response)
     async def events(
@@ -160,6 +162,12 @@ def _add_facts(router: APIRouter, api: Api) -> None:
     ) -> StreamingResponse:
         stream = api.events(last_event_id, status_s, history=history)
         return StreamingResponse(stream, media_type="text/event-stream", headers=NO_STORE)
+
+
+def _add_judgements(router: APIRouter, api: Api) -> None:
+    @router.get("/health", summary="Is all well? One word, one sentence, and the checks behind them")
+    async def health() -> Health:
+        return await api.health()
 
     @router.get("/metrics", summary="For Prometheus", responses=TEXT, response_class=Response)
     async def metrics() -> Response:

@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING, TypeVar
 from acquire.daemon.beginning import begin
 from acquire.daemon.connections import ApiServer, raise_descriptor_limit
 from acquire.daemon.control import build_app
+from acquire.daemon.devices import KnownDevices
 from acquire.daemon.disk_watch import disk_watch
 from acquire.daemon.ending import END_S, LastResort, leave
 from acquire.daemon.endpoint import Endpoint
@@ -85,13 +86,13 @@ def serve(config: RigConfig, origin: str = "", reread: Callable[[], RigConfig] |
         journal = journal_path(directory, config.name, "uploads")
         uploads = Uploads(config.recording.upload_to, journal, config.recording.reserve_bytes)
         uploads.begin()
-        proof = Proof(config)
+        proof, devices = Proof(config), KnownDevices()
 
         def open_run(request: ArmRequest) -> Run:
             # Not the outer `config`: the service's may have been reloaded.
             config = armed_as(service.config, request)
             check_rig(config)
-            return Run(config, rig, proof.choose)
+            return Run(config, rig, proof.choose, devices)
 
         disk = disk_watch(config, claim)
         service = Service(config, open_run, proof, salvage, uploads, troubles, disk)
@@ -100,7 +101,7 @@ def serve(config: RigConfig, origin: str = "", reread: Callable[[], RigConfig] |
         reloading = None if reread is None else Reloading(reread, service, hooks)
         # Closed after the loop has ended, so that the last news still reach the hooks.
         with contextlib.closing(page), contextlib.closing(hooks):
-            code = asyncio.run(Daemon(service, endpoint, page, reloading).run())
+            code = asyncio.run(Daemon(service, endpoint, page, reloading, devices).run())
         last_resort = LastResort(endpoint.remove)
         last_resort.within(END_S)  # for devices that do not close
     last_resort.cancel()
@@ -130,9 +131,10 @@ class Daemon:
         endpoint: Endpoint,
         page: Page | None = None,
         reloading: Reloading | None = None,
+        devices: KnownDevices | None = None,
     ) -> None:
         self._service = service
-        self._api = Local(service, self._command, reloading)
+        self._api = Local(service, self._command, reloading, devices)
         self._hangup_reloads = reloading is not None and not ends_with_terminal()
         self._hung_up: asyncio.Task[None] | None = None
         self._page = page

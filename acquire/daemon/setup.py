@@ -14,9 +14,12 @@ from acquire.daemon.facts import RingPlace, Rings, Setup, Version
 from acquire.lines import ARMS
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from pydantic import BaseModel
 
     from acquire.config import RigConfig
+    from acquire.daemon.facts import DeviceFacts
     from acquire.daemon.service import Service
 
 LIBRARIES = (
@@ -36,7 +39,7 @@ def version_of(config: RigConfig) -> Version:
     return Version(acquire=__version__, name=config.name, pid=os.getpid(), python=platform.python_version())
 
 
-def setup_of(config: RigConfig, origin: str) -> Setup:
+def setup_of(config: RigConfig, origin: str, devices: Sequence[DeviceFacts] = ()) -> Setup:
     """Return the whole setup, read from the file ``origin``; it holds no secrets (`config.recording`)."""
     rate_hz = config.line_rate_hz
     versions = {"acquire": __version__, "python": platform.python_version()}
@@ -55,6 +58,7 @@ def setup_of(config: RigConfig, origin: str) -> Setup:
         black_dn={arm: config.cameras.arm(arm).black_level_dn for arm in ARMS},
         history_s=config.history_s,
         versions=versions,
+        devices=list(devices),
     )
 
 

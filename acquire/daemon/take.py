@@ -78,6 +78,7 @@ class Take:
     marks: deque[Note] = field(default_factory=lambda: deque(maxlen=MOST_MARKS))
     _progress: tuple[int, int] = (-1, -1)
     _moved_s: float = field(default_factory=time.monotonic)
+    _commit: tuple[int, float] = (0, 0.0)
 
     @property
     def in_words(self) -> str:
@@ -107,7 +108,14 @@ class Take:
             recorded_lines=seen.recorded_lines,
             committed_lines=seen.committed_lines,
             beyond_bytes=seen.beyond_bytes,
+            commit_age_s=self._commit_age_s(seen.committed_lines),
         )
+
+    def _commit_age_s(self, committed: int) -> float | None:
+        """Return the time since the number of committed lines was last seen to rise; None before that."""
+        if committed != self._commit[0]:
+            self._commit = committed, time.monotonic()
+        return round(time.monotonic() - self._commit[1], 3) if committed else None
 
     def marks_after(self, seen: CaptureStatus) -> str:
         """Return a clause on the marks after the last line of a recording that has ended; "" if none."""

@@ -21,6 +21,7 @@ from acquire.daemon.routes import NO_STORE, RequestId, routes
 from acquire.errors import AcquireError, BusyError, UsageError
 from acquire.web.archive import Archive
 from acquire.web.calibrations import calibration_facts, place_of
+from acquire.web.checkup import Checkup
 from acquire.web.guard import Guard
 from acquire.web.hub import Hub
 from acquire.web.jobs import Jobs
@@ -28,6 +29,7 @@ from acquire.web.live import Live
 from acquire.web.messages import (
     CalibrationFacts,
     CalibrationRequest,
+    CheckupFacts,
     HoldRequest,
     JobFacts,
     JobRequest,
@@ -126,16 +128,18 @@ def build_page(
 
     app = new_app(
         "The instrument's page: the daemon's API, recordings, videos and jobs.",
+        "the page's server",
         # Below /api, where the guard demands a token.
         openapi_url="/api/openapi.json",
         lifespan=lifespan,
     )
     api = APIRouter(prefix="/api", responses=WHY_REFUSED)
     answers = Answers()
-    api.include_router(routes(Passing(hub), answers))
+    api.include_router(routes(Passing(hub, tokens), answers))
     _add_stream(api, OpenPages(hub))
     _add_recordings(api, archive, reading, answers)
     _add_jobs(api, jobs, answers)
+    _add_checkup(api, Checkup(socket), answers)
     _add_calibration(api, hub, jobs, directory, reading, answers)
     guard = Guard(app, tokens, names)
     _add_session(api, guard, tokens, secure=secure)
@@ -268,6 +272,16 @@ def _add_jobs(api: APIRouter, jobs: Jobs, answers: Answers) -> None:
     @api.delete("/jobs/{number}", summary="Stop a job")
     async def stop(number: int) -> JobFacts:
         return await jobs.stop(number)
+
+
+def _add_checkup(api: APIRouter, checkup: Checkup, answers: Answers) -> None:
+    @api.get("/doctor", summary="The latest examination of the host")
+    async def latest() -> CheckupFacts:
+        return checkup.facts
+
+    @api.post("/doctor", summary="Examine the host, at the lowest priority and without touching a device")
+    async def examine(request_id: RequestId = None) -> CheckupFacts:
+        return await answers.once(request_id, "doctor", checkup.examine)
 
 
 def _add_calibration(

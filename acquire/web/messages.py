@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from datetime import datetime
 from typing import Literal
 
 from pydantic import Field
@@ -146,6 +147,23 @@ class JobFacts(Message):
     done: float | None = Field(default=None, description="amount of work done")
     total: float | None = Field(default=None, description="total amount of work")
     result: Text | None = Field(default=None, description="name of its result")
+
+
+class CheckupFinding(Message):
+    """A finding about the host: what was examined, its condition, and what to do if it is not good."""
+
+    name: Text
+    level: Literal["good", "warning", "bad"]
+    text: Text
+    todo: Text = ""
+
+
+class CheckupFacts(Message):
+    """The latest examination of the host."""
+
+    examined: datetime | None = Field(default=None, description="when; null: not since the page started")
+    running: bool = Field(default=False, description="another examination is running")
+    findings: list[CheckupFinding] = Field(default=[])
 
 
 class FindingFacts(Message):

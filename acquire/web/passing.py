@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import time
 from typing import TYPE_CHECKING
 
 from acquire.client import core
+from acquire.daemon.facts import LogTail
 from acquire.daemon.messages import Status
 from acquire.daemon.stream import ALIVE, news_text, status_text
 
@@ -14,13 +16,19 @@ if TYPE_CHECKING:
     from acquire.daemon.facts import Health, Reloaded, Rings, Setup, Version
     from acquire.daemon.messages import ArmRequest, CapacityStatus, MarkRequest, StartRequest
     from acquire.web.hub import Hub
+    from acquire.web.tokens import TokenFile, Tokens
+
+KEPT_S = 1.0
+"""Age up to which all pages get the same end of the daemon's log."""
 
 
 class Passing:
     """See the module; the methods are those of `acquire.daemon.routes.Api`."""
 
-    def __init__(self, hub: Hub) -> None:
+    def __init__(self, hub: Hub, tokens: Tokens | TokenFile) -> None:
         self._hub = hub
+        self._tokens = tokens
+        self._log, self._log_s = LogTail(entries=[]), -KEPT_S
         self._client = hub.client
 
     async def status(self) -> Status:
@@ -59,6 +67,15 @@ class Passing:
 
     async def rings(self) -> Rings:
         return await self._client.rings()
+
+    async def log(self) -> LogTail:
+        # Once a second, however many pages show it.
+        now_s = time.monotonic()
+        if now_s - self._log_s >= KEPT_S:
+            self._log = await self._client.log()
+            self._log_s = now_s  # only now: an old one is not shown in place of an error
+        hide = self._tokens.taken_out_of
+        return LogTail(entries=[one.model_copy(update={"text": hide(one.text)}) for one in self._log.entries])
 
     async def events(
         self, last_id: str | None, status_s: float | None, *, history: bool

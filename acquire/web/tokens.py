@@ -55,6 +55,10 @@ class Tokens:
         """Return the cookie that a browser gets for the token."""
         return hmac.new(self._of(role).encode(), f"session {role}".encode(), hashlib.sha256).hexdigest()
 
+    def taken_out_of(self, text: str) -> str:
+        """Return a text without the tokens, which a viewer must not find in what somebody else wrote."""
+        return text.replace(self.operator, "…").replace(self.viewer, "…")
+
     def _of(self, role: Role) -> str:
         return self.operator if role == "operator" else self.viewer
 
@@ -85,6 +89,9 @@ class TokenFile:
 
     def cookie(self, role: Role) -> str:
         return self.current.cookie(role)
+
+    def taken_out_of(self, text: str) -> str:
+        return self.current.taken_out_of(text)
 
     @property
     def current(self) -> Tokens:

@@ -173,6 +173,7 @@ def test_the_async_client_commands_and_is_refused_as_the_other(path: Path, daemo
             assert (await client.version()).api == API_VERSION
             assert (await client.setup()).name == "demo"
             assert (await client.rings()).run_id == "fake-run"
+            assert (await client.log()).entries == []  # this process writes none
             await client.disarm()
 
     asyncio.run(work())

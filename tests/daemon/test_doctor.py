@@ -15,12 +15,16 @@ from pathlib import Path
 import pytest
 import typer
 from fake_run import rig_config
+from waiting import until
 
 import acquire
+from acquire.client import Client
 from acquire.config import RigConfig
 from acquire.daemon import doctor
+from acquire.daemon.checkup import examine_running
 from acquire.daemon.disk_watch import disk_watch
 from acquire.daemon.doctor import CheckResult, examine
+from acquire.daemon.service import Service
 
 
 def found(rig: RigConfig | None, name: str, running: str | None = None) -> CheckResult:
@@ -123,6 +127,27 @@ def test_a_port_that_is_taken_and_a_daemon_of_another_version(tmp_path: Path) ->
         rig = rig_config(tmp_path, **{"web.port": taken.getsockname()[1]})
         assert found(rig, "page").level == "warning"
     assert found(None, "daemon", "0.0.9").level == "warning"
+
+
+def test_a_daemon_that_runs_is_examined_by_its_own_setup(
+    daemon: Client, service: Service, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The rings of an armed run are there already, and its page has the port."""
+    monkeypatch.setattr(doctor, "available_bytes", lambda: 1000)
+    taken = rig_config(service.config.recording.directory, **{"web.port": 1, "stream.realtime": True})
+    service.reconfigure(taken, "")
+    service._disk.check(recording=False)
+    until(lambda: service.status().disk is not None, "the disk")
+
+    def now() -> dict[str, CheckResult]:
+        return {one.name: one for one in examine_running(daemon.setup(), daemon.status())}
+
+    idle = now()
+    assert (idle["memory"].level, "page" in idle) == ("bad", False)
+    assert str(service.config.recording.directory) in idle["disk"].text
+    assert "is running" in idle["daemon"].text
+    daemon.arm()
+    assert now()["memory"].level == "good"
 
 
 def test_producers_of_cameras_are_looked_for(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

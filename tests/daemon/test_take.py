@@ -22,6 +22,17 @@ def test_marks_after_the_last_line_are_named() -> None:
     assert take.marks_after(replace(SEEN, committed_lines=201)) == ""
 
 
+def test_the_age_of_the_last_commit_begins_with_each(monkeypatch: pytest.MonkeyPatch) -> None:
+    now = [100.0]
+    monkeypatch.setattr("acquire.daemon.take.time.monotonic", lambda: now[0])
+    take, ages = Take(Path("r.zarr"), None), []
+    for committed in (0, 500, 500, 900):
+        now[0] += 3.0
+        seen = CaptureStatus(path="r.zarr", committed_lines=committed)
+        ages.append(take.status(seen).commit_age_s)
+    assert ages == [None, 0.0, 3.0, 0.0]
+
+
 def test_a_failure_says_its_reason_once() -> None:
     """What went wrong after it is added only if it is something else."""
     assert and_then("the disk is full", "the disk is full") == "the disk is full"

@@ -60,6 +60,19 @@ def test_a_take_from_arming_to_the_video(page: Page, daemon: Daemon) -> None:
     page.locator(".none").first.wait_for(state="hidden", timeout=SEEN_MS)  # the first rows have been drawn
     page.locator(".arm header", has_text="level").first.wait_for(timeout=SEEN_MS)
     until_past(daemon, seconds=0.3)
+    page.keyboard.press("5")
+    page.locator("#setup dd", has_text="acquire simulated TDI camera").first.wait_for(timeout=SEEN_MS)
+    devices = page.inner_text("#setup section[aria-label=Devices]")
+    assert "sync trigger (model)\nfirmware " in devices, devices
+    assert "at simulated trigger" in devices
+    page.keyboard.press("4")
+    page.locator("#latencies", has_text="s old").wait_for(timeout=SEEN_MS)
+    page.locator("#log li", has_text="idle → armed").wait_for(timeout=SEEN_MS)
+    page.click("#examine")
+    page.locator("#findings tr", has_text="acquire 0.1.0 is running").wait_for(timeout=SEEN_MS)
+    assert not page.get_by_role("cell", name="camera a", exact=True).count(), "no device is opened"
+    page.wait_for_selector("#examine:enabled", timeout=SEEN_MS)
+    page.keyboard.press("1")
     page.fill("#pre", "0.2")
     page.keyboard.press("Tab")
     page.click("#record")

@@ -9,6 +9,7 @@ import contextlib
 import os
 import re
 from collections.abc import Callable, Iterator
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -24,6 +25,7 @@ from acquire.daemon.endpoint import Endpoint
 from acquire.daemon.messages import DiskStatus
 from acquire.daemon.service import Service
 from acquire.errors import CameraError
+from acquire.logs import KeptEntry
 from acquire.stream.ring import RingShape
 
 if TYPE_CHECKING:
@@ -243,8 +245,44 @@ def test_the_reason_why_there_is_no_picture_is_shown_in_its_place(
     assert "run as the daemon's user" in words
     page.goto(page.url.partition("#")[0] + "#/aim")
     page.wait_for_selector("#aim-view p.none:has-text('No picture')", timeout=SEEN_MS)
+    assert "brightest value of each pixel, in\u00a0% of white" in page.inner_text("#aim-view .axis")
     instrument.client.disarm()
     page.wait_for_selector("#aim-view p.none:has-text('No lines: arm the instrument')", timeout=SEEN_MS)
+
+
+def test_health_has_latencies_and_the_end_of_the_log(
+    page: Page, instrument: Instrument, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    texts = {"info": "idle → armed (arm)", "warning": "the disk is <b>slow</b>", "error": "start: refused"}
+    texts["debug"] = f"a viewer must not have {instrument.server.operator} of somebody's mark"
+    now = datetime.now(UTC)
+    entries = [KeptEntry(now, level, text) for level, text in texts.items()] * 12
+    monkeypatch.setattr("acquire.daemon.local.latest_entries", lambda: entries)
+    page.keyboard.press("4")
+    page.locator("#log li", has_text="! warning the disk is <b>slow</b>").first.wait_for(timeout=SEEN_MS)
+    assert page.locator("#log li", has_text="✗ error start: refused").count() == 12
+    assert page.locator("#log li").first.inner_text().endswith("a viewer must not have … of somebody's mark")
+    latencies = page.locator("#latencies")
+    assert latencies.inner_text().count("– (not armed)") == 3
+    record(instrument)
+    instrument.see(
+        trigger={"clock_hz": 1, "uncertainty_ns": 1, "pulses": 9, "silent_s": 0.4}, path="/d/x.zarr"
+    )
+    found = re.compile(r"none has come yet.*[\d.]+.m?s ago; 10.000 recorded lines .*0\.4.s ago", re.DOTALL)
+    latencies.filter(has_text=found).wait_for(timeout=SEEN_MS)
+    every_width(page, "health")
+
+
+def every_width(page: Page, name: str) -> None:
+    """Nothing reaches beyond the screen, in both themes."""
+    for theme in ("light", "dark"):
+        page.emulate_media(color_scheme=theme)  # type: ignore[arg-type]
+        for width in WIDTHS:
+            page.set_viewport_size({"width": width, "height": 900})
+            wide = page.evaluate("document.documentElement.scrollWidth")
+            assert wide <= width, f"{name} is {wide} px wide where {width} are to be had"
+            if SCREENSHOTS:
+                page.screenshot(path=Path(SCREENSHOTS) / f"{name}-{theme}-{width}.png", full_page=True)
 
 
 def test_all_can_be_reached_and_done_by_key(page: Page, instrument: Instrument) -> None:
@@ -331,6 +369,9 @@ def test_a_refusal_is_shown_with_the_daemons_message(page: Page, instrument: Ins
     page.keyboard.press("a")
     page.locator("#error", has_text="camera b is not plugged in").wait_for(timeout=SEEN_MS)
     assert "try: plug it in" in page.inner_text("#error")
+    refused = page.request.get(f"{instrument.server.address}api/nothing").json()
+    assert refused["message"].startswith("the page's server cannot answer GET /api/nothing: ")
+    assert refused["possible"] == "/api/openapi.json"
 
 
 def test_a_key_without_effect_is_explained(browser: Browser, instrument: Instrument) -> None:
@@ -378,6 +419,7 @@ def test_a_viewer_may_look_and_a_stranger_must_log_in(browser: Browser, instrume
         page.wait_for_selector("#enter:not([open])", state="attached", timeout=SEEN_MS)
         page.wait_for_selector("body[data-state=idle]", timeout=SEEN_MS)
         assert page.is_disabled("#arm")
+        assert page.is_disabled("#examine")
         page.keyboard.press("a")
         page.locator("#error", has_text="logged in as a viewer").wait_for(timeout=SEEN_MS)
         assert instrument.server.viewer not in page.url

@@ -1,6 +1,6 @@
 // Alignment of a new instrument: one large camera with its sharpness, brightness and light profile.
 
-import { Waterfall } from "./waterfall.js";
+import { Waterfall, marginOf } from "./waterfall.js";
 import { $, make, noLines, percent } from "./words.js";
 
 export class Aim {
@@ -8,9 +8,11 @@ export class Aim {
 
   constructor() {
     const canvas = make("canvas", { role: "img", "aria-label": "The selected camera" });
-    this.#profile = make("canvas", { className: "histogram", role: "img", "aria-label": "Brightest value of each pixel" });
+    this.#profile = make("canvas", { className: "histogram profile", role: "img", "aria-label": "Brightest value of each pixel" });
     this.#fall = new Waterfall(canvas, 480);
-    $("aim-view").replaceChildren(make("div", { className: "fall" }, make("div", { className: "scale", "aria-hidden": "true" }, make("span", {}, "−5 s"), make("span", {}, "now")), canvas, this.#none), this.#profile);
+    $("aim-view").replaceChildren(make("div", { className: "fall" }, make("div", { className: "scale", "aria-hidden": "true" }, make("span", {}, "−5 s"), make("span", {}, "now")), canvas, this.#none),
+      make("div", { className: "chart" }, make("div", { className: "scale", "aria-hidden": "true" }, make("span", {}, "100\u202f%"), make("span", {}, "0")), this.#profile),
+      make("div", { className: "axis chart-axis" }, make("span", {}, "first pixel"), make("span", {}, "brightest value of each pixel, in\u00a0% of white"), make("span", {}, "last pixel")));
     $("aim-numbers").replaceChildren(make("h2", {}, "Focus"), this.#focus, make("h2", {}, "Best so far"), this.#best, make("h2", {}, "Saturated pixels"), this.#white,
       make("p", { className: "hint" }, "Focus is the contrast between neighbouring pixels in percent of the light, from the brightest values. Turn the lens until it decreases again, and go back to the best."));
     this.#forget();
@@ -54,6 +56,8 @@ export class Aim {
   #draw() {
     const profile = this.#shown, canvas = this.#profile, width = (canvas.width = canvas.clientWidth || 300), height = (canvas.height = canvas.clientHeight || 70), context = canvas.getContext("2d");
     context.fillStyle = getComputedStyle(canvas).color;
-    profile.forEach((value, x) => context.fillRect((x * width) / profile.length, height - (value / 255) * height, Math.max(1, width / profile.length - 1), (value / 255) * height));
+    // Each bar stands below its pixel in the picture, which begins with a margin.
+    const margin = marginOf(profile.length), step = width / (margin + profile.length);
+    profile.forEach((value, x) => context.fillRect((margin + x) * step, height - (value / 255) * height, Math.max(1, step - 1), (value / 255) * height));
   }
 }

@@ -5,15 +5,16 @@ import { Band } from "./band.js";
 import { Calibrate } from "./calibrate.js";
 import { showHealth, showSetup } from "./facts.js";
 import { Glimpse } from "./glimpse.js";
+import { Checkup, Latencies, LogTail } from "./health.js";
 import { Link, ask } from "./link.js";
 import { Recordings } from "./recordings.js";
 import { Watch } from "./watch.js";
 import { $ } from "./words.js";
 
 const SCREENS = ["watch", "aim", "recordings", "health", "setup"];
-const link = new Link(), band = new Band(), watch = new Watch(fail), aim = new Aim(), calibrate = new Calibrate(fail), recordings = new Recordings(fail);
+const link = new Link(), logTail = new LogTail(), latencies = new Latencies(), checkup = new Checkup(fail), band = new Band(), watch = new Watch(fail), aim = new Aim(), calibrate = new Calibrate(fail), recordings = new Recordings(fail);
 new Glimpse(link);
-let operator = false, setup = null, latest = null;
+let operator = false, setup = null, latest = null, run = null;
 
 function fail(text) { $("error").textContent = text; $("error").hidden = !text; }
 
@@ -28,7 +29,7 @@ async function admitted() {
   const { role } = await ask("GET", "whoami");
   operator = role === "operator";
   await ask("GET", "setup").then((facts) => { setup = facts; }, () => {});
-  watch.enter(operator, setup); recordings.enter(operator); calibrate.enter(operator);
+  watch.enter(operator, setup); recordings.enter(operator); calibrate.enter(operator); checkup.enter(operator);
   $("enter").close();
   screen();
 }
@@ -38,6 +39,8 @@ function screen() {
   const asked = location.hash.replace("#/", ""), shown = SCREENS.includes(asked) ? asked : "watch";
   for (const name of SCREENS) $(name).hidden = name !== shown;
   for (const anchor of document.querySelectorAll("nav a")) if (anchor.dataset.screen === shown) anchor.setAttribute("aria-current", "page"); else anchor.removeAttribute("aria-current");
+  if (shown === "health") { logTail.show(); if (setup) checkup.show(); }
+  if (latest) latencies.show(latest.status, latest.live_error);
   if (shown === "recordings") recordings.show();
   if (shown === "aim" && setup) calibrate.open();
   if (shown === "setup") ask("GET", "setup").then((facts) => { setup = facts; showSetup(setup, latest?.status); }, (error) => fail(error.message));
@@ -53,13 +56,16 @@ link.addEventListener("news", ({ detail }) => {
   watch.news(detail.header.news);
   if (detail.header.news.kind === "reload" && !$("setup").hidden) screen();
 });
-link.addEventListener("rows", ({ detail }) => { watch.rows(detail.header, detail.body); aim.rows(detail.header, detail.body); });
+link.addEventListener("rows", ({ detail }) => { watch.rows(detail.header, detail.body); aim.rows(detail.header, detail.body); latencies.rows(detail.header); });
 link.addEventListener("state", ({ detail }) => {
   latest = detail.header.state;
+  // Arming makes the devices known that Setup shows.
+  if (run !== (run = latest.status.run_id) && !$("setup").hidden) screen();
   band.show(latest.status, latest.health, latest.for_s);
   watch.show(latest.status, latest.live_error);
   aim.show(latest.status, latest.live_error);
   calibrate.show(latest.status);
+  latencies.show(latest.status, latest.live_error);
   showHealth(latest.status, latest.health, fail, operator);
   if (!setup) admitted().catch(() => {});
 });

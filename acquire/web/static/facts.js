@@ -3,18 +3,18 @@
 import { ask } from "./link.js";
 import { $, clock, count, duration, fill, make, quantity } from "./words.js";
 
-const table = (titles, rows) => make("div", { className: "scroll" }, make("table", {},
+export const table = (titles, rows) => make("div", { className: "scroll" }, make("table", {},
   make("tr", {}, ...titles.map((title) => make("th", { scope: "col" }, title))),
   ...rows.map((cells) => make("tr", {}, ...cells.map((cell) => make("td", {}, cell))))));
 const panel = (title, ...children) => make("section", { className: "panel", "aria-label": title }, make("h2", {}, title), ...children);
 const wide = (section) => { section.classList.add("whole"); return section; };
-const MARKS = { good: "✓ good", unknown: "· unknown", warning: "! warning", bad: "✗ bad" };
+export const MARKS = { good: "✓ good", unknown: "· unknown", warning: "! warning", bad: "✗ bad" };
 
 export function showHealth(status, health, fail, operator) {
   if ($("health").hidden) return;
   const capacity = status.capacity;
   const key = JSON.stringify([health, capacity, status.processes, status.uploads, status.recoveries, status.troubles, status.state, operator]);
-  fill($("health"), key, () => [make("div", { className: "panels" },
+  fill($("facts"), key, () => [make("div", { className: "panels" },
     wide(panel("Checks against fixed thresholds", table(["check", "", "now", "thresholds"], health.checks.map((check) =>
       [check.name, make("span", { className: check.level }, MARKS[check.level]), check.text, check.limit])))),
     panel("What this host sustains", capacity
@@ -28,13 +28,23 @@ export function showHealth(status, health, fail, operator) {
     panel("Unexpected failures", status.troubles.length ? table(["last", "failure", "count"], status.troubles.map((one) => [clock(one.last), one.text, String(one.times)])) : make("p", {}, "None.")))]);
 }
 
+/** As armed last, each on a line of its own: model and version, serial number, and the trigger's port. */
+function devices(found) {
+  if (!found.length) return [make("p", {}, "Not known until the instrument is armed.")];
+  const words = (one) => [[one.vendor, one.model].filter(Boolean).join(" ") || "model not stated",
+    ...[["firmware", one.firmware], ["serial number", one.serial], ["at", one.port]].filter(([, value]) => value).map(([name, value]) => `${name} ${value}`)];
+  return [make("dl", {}, ...found.flatMap((one) => [make("dt", {}, one.device), make("dd", {}, ...words(one).map((text) => make("div", {}, text)))])),
+    make("p", { className: "hint" }, "As they described themselves when the instrument was last armed.")];
+}
+
 export function showSetup(setup, status) {
   if (!setup) return;
-  const key = JSON.stringify([setup.config, setup.versions, status?.pid]);
+  const key = JSON.stringify([setup.config, setup.versions, setup.devices, status?.pid]);
   fill($("setup"), key, () => [make("div", { className: "panels" },
     panel("Changes from the defaults", make("p", {}, `Rig ${setup.name}, from ${setup.file || "no file"}. To change it, edit the file and restart the daemon.`),
       table(["key", "value"], Object.entries(setup.changed).map(([name, value]) => [name, JSON.stringify(value)]))),
+    panel("Devices", ...devices(setup.devices)),
     panel("Versions", table(["library", "version"], Object.entries(setup.versions))),
     panel("Lines", table(["", ""], [["rate", quantity(setup.line_rate_hz, "lines/s")], ["period set by the trigger", quantity(setup.line_period_ns / 1e9, "s")], ["the rings hold", duration(setup.history_s)]])),
-    panel("Complete configuration", make("pre", { tabIndex: 0 }, JSON.stringify(setup.config, null, 2))))]);
+    wide(panel("Complete configuration", make("pre", { tabIndex: 0 }, JSON.stringify(setup.config, null, 2)))))]);
 }

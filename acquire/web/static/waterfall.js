@@ -3,6 +3,9 @@
 export const SHOWN_S = 5;
 const LOST = 1, UNSEEN = 2;
 
+/** Width of the strip that marks the kind of each row, in columns. */
+export const marginOf = (columns) => Math.max(1, Math.round(columns / 100));
+
 export class Waterfall {
   #context; #columns = 0; #next = null; #merge = null; #height;
 
@@ -31,7 +34,7 @@ export class Waterfall {
 
   #begin(columns) {
     this.#columns = columns;
-    this.margin = Math.max(1, Math.round(columns / 100));  // a strip that marks the kind of each row
+    this.margin = marginOf(columns);
     this.canvas.width = columns + this.margin; this.canvas.height = this.#height;
     this.#merge = { values: new Uint8Array(columns), kind: 0, count: 0, seen: false };
     this.ready = [];
