@@ -136,7 +136,7 @@ def test_a_wider_band_that_explains_little_more_is_not_worth_its_noise(
     monkeypatch.setattr(blinking, "pursue", lambda *_: None)
     monkeypatch.setattr(blinking, "find_lamps", lambda *_: [])
     # whether the lines show light beyond the band is here a matter of rounding
-    monkeypatch.setattr(blinking, "light_beyond", lambda *_: 286)
+    monkeypatch.setattr(blinking, "light_beyond", lambda *_: 160)
     recorded = record("leds_dot", 35, stages=32, lines=160, camera=CLEAN)
     result = reconstruct(recorded.segment, 3, 1, check=False, error=False)
     assert result.parameters["temporal_coefficients"] < 100
