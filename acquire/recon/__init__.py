@@ -11,12 +11,13 @@
     solvers        solver                the interface; solve, twist: the paper's, and a known image
                     │
     the default    choose                which prior predicts best; reuse: that of another part of the scene
-                    ├─ workbench         trials of candidates: still, volume, cycle, brightness
+                    ├─ workbench         trials of candidates: still, volume, cycle, brightness; spectrum:
+                    │                    of what flows; chosen: the best of them
                     └─ blinking          cosines: bandwidth, lamps, pursuit
                         └─ patterns      with curves; evidence, settling, darkness; beside_motion,
                                          joined
-    iterations     admm                  sign, tv, volume, ground, drift, rotation, denoisers, kernels:
-                                         proximal steps
+    iterations     admm                  sign, tv, volume, smooth, ground, drift, rotation, denoisers,
+                                         kernels: proximal steps
                     │
     judgement      estimates             what any solver returns
                     ├─ judge             residuals and warnings; sanity, aliasing, unseen

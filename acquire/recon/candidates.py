@@ -14,8 +14,9 @@ from acquire.recon.admm import AdmmParameters
 from acquire.recon.basis import CyclicBasis, TemporalBasis
 from acquire.recon.cycle import most_harmonics
 from acquire.recon.ground import GroundedTv
+from acquire.recon.smooth import Smooth
 from acquire.recon.tv import FrameTv
-from acquire.recon.volume import Smooth, VolumeTv
+from acquire.recon.volume import VolumeTv
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -46,7 +47,8 @@ class Candidate:
     ``brightness``: times a free brightness of the whole scene; ``change``: the difference from the best
     still; ``fine``: solved at N_m = 1, then merged; ``robust``: samples with large residuals have less
     weight. ``drift`` is the velocity of a volume's contents and ``rotation`` their turn, see `VolumeTv`;
-    () is none. ``speed_changes`` are those of a cycle, or of these.
+    () is none. ``speed_changes`` are those of a cycle, or of these. ``learned``: the spectrum of a smooth
+    volume is learned from the lines, beginning with this weight and pace (`spectrum`).
     """
 
     prior: Literal["still", "smooth", "volume", "cycle"]
@@ -62,6 +64,7 @@ class Candidate:
     speed_changes: tuple[float, ...] = ()
     drift: tuple[float, ...] = ()
     rotation: tuple[float, ...] = ()
+    learned: bool = False
 
     def denoiser(self) -> Denoiser:
         """The denoiser of this prior."""
@@ -157,7 +160,8 @@ def parameters(candidate: Candidate, frames: int, response: float) -> AdmmParame
         # small penalties and data steps run to their end recover the details.
         weight, penalty, steps = w * extent, 0.1 * w, STILL_STEPS
     elif candidate.prior == "smooth":
-        weight, penalty, steps = w, 2e-3, 2
+        # A spectrum that was learned has the lines' own units.
+        weight, penalty, steps = 1 / response if candidate.learned else w, 2e-3, 2
     else:
         weight, penalty, steps = w * extent, 2e-3 * (w / 1e-3) ** 0.5, 2
     weight, penalty = response * weight, response * penalty

@@ -4,7 +4,7 @@
     volume     few cosines, total variation of a volume           for motion; also before a still ground, and
                                                                   times a free brightness
     cycle      harmonics of a period, total variation of a cycle  for motion that repeats
-    smooth     few cosines, quadratic in second differences       for flow
+    smooth     few cosines, quadratic, then with their spectrum   for flow
     cosines    the whole band, total variation of coefficients    for lamps, then as patterns and curves
 
 Where a still explains most of the lines and a volume is not clearly better, the cosines start from the still:
@@ -53,6 +53,7 @@ from acquire.recon.patterns import find_patterns, has_clear_patterns
 from acquire.recon.reuse import reuse_choice
 from acquire.recon.rotation import turning
 from acquire.recon.solver import Preset, Solver
+from acquire.recon.spectrum import learn_spectrum
 from acquire.recon.still import best_still, change_bench, weighted_like
 from acquire.recon.workbench import (
     BRIGHTER,
@@ -79,12 +80,18 @@ ITERATIONS_PER_TRIAL = 10
 """Iterations of a preset for each trial of a search."""
 OUTDONE = 0.6
 """Largest error of the cosines at a glance, relative to the other candidates, for which they are continued
-before the others are searched. The glance of lamps has 0.25 to 0.55."""
+before the others are searched, and of a rival of what follows, for which that goes no further. The glance of
+lamps has 0.25 to 0.55. The same of a smooth volume, relative to a first volume, for which it is evident that
+something flows: flames and waves have 0.3 to 0.9."""
 FAR = 1.25
 """Largest error of a smooth volume or a still, relative to the volume's, for which it is searched further."""
 SMOOTHER = 0.85
 """Largest error of a smooth volume, relative to the volume's, for which it is preferred: a quadratic prior
 admits more noise that does not show."""
+FLOWS = 0.9
+"""Largest error of a smooth volume, relative to the best of the others, all after their first trials, for
+which these are not searched further: flames and waves have 0.35 to 0.86, a few flames 1.04, and all else 1.03
+and more, but for a flash before a still."""
 MOVING = 0.97
 """Largest error of a volume, relative to a still's, for which it is preferred; the change from a still equals
 the still where its prior is strong, and need only be better."""
@@ -151,25 +158,13 @@ def _choose(bench: Workbench, volume: Trial, trials: int) -> Estimate:
     errors = bench.record_errors({"prior": "cosines"} | cosines.facts(), cosines.predict())
     at_a_glance, clear = bench.held_out.relative(errors), has_clear_patterns(cosines)
     tried = _Tried(volume, plain)
-    # These are tried even where cosines are ahead: a scene that flickers gains 6.6 to 15 dB by this, a flame
-    # up to 3.5, and what moves or turns by a path or a cycle. Evident lamps need the time for themselves.
     lamps = isinstance(cosines.basis, LearnedBasis) and tried.best.error > HOPELESS * at_a_glance
-    followed = None if clear or lamps else _following(volume, at_a_glance)
-    # What moves as one neither flows nor flickers.
-    if not (clear or lamps or followed):
-        tried.smooth = bench.probe(bench.fitting(SMOOTH), min(at_a_glance, tried.best.error))
-        # The first cosine is constant, so that this is the video's mean over time.
-        picture = (cosines.basis.matrix()[0, 0] * host(cosines.solver.theta[0, ...])).clip(0)
-        tried.bright = bench.brighten(picture, cosines.basis.cosines, min(at_a_glance, tried.best.error))
-    # Evident lamps need this time for themselves, too, which is 3 % of 10 s.
-    rises = (0.0,) if lamps else TRIED_CHANGES
-    repeats = None if clear else find_period(cosines.solver.theta, cosines.basis, rises)
-    if repeats is not None and not clock.spent(SEARCH_SHARE):
-        rival = min(at_a_glance, tried.best.error)
-        cycle = bench.repeat(*repeats, rival)
-        if REPEATS * rival <= cycle.error < rival:
-            cycle = _or_turning(cycle, rival)
-        tried.cycle = cycle if cycle.error < REPEATS * rival else None
+    # Evident lamps need the time for themselves.
+    followed = None if clear or lamps else _try_motion(bench, tried, cosines, at_a_glance)
+    if not (clear or tried.flows):
+        # Evident lamps need the time that changes of speed take, which is 3 % of 10 s.
+        rises = (0.0,) if lamps else TRIED_CHANGES
+        tried.cycle = _cycle(bench, cosines, rises, min(at_a_glance, tried.best.error))
     tried.followed = followed  # from now on: a cycle at rest competes with what is at rest
     ahead, refined = at_a_glance <= OUTDONE * tried.best.error, None
     if ahead:
@@ -189,6 +184,35 @@ def _choose(bench: Workbench, volume: Trial, trials: int) -> Estimate:
     return bench.finish(best)
 
 
+def _try_motion(bench: Workbench, tried: _Tried, cosines: InBand, at_a_glance: float) -> Trial | None:
+    """Try what flows, what moves as one and what flickers; return the volume that follows what moves.
+
+    These are tried even where cosines are ahead: a scene that flickers gains 6.6 to 15 dB by this, a flame up
+    to 7, and what moves or turns by a path or a cycle.
+    """
+    tried.smooth = bench.probe(bench.fitting(SMOOTH), min(at_a_glance, tried.best.error))
+    if tried.flows:
+        return None
+    followed = _following(tried.volume, min(at_a_glance, tried.smooth.error))
+    # What moves as one does not flicker.
+    if followed is None:
+        # The first cosine is constant, so that this is the video's mean over time.
+        picture = (cosines.basis.matrix()[0, 0] * host(cosines.solver.theta[0, ...])).clip(0)
+        tried.bright = bench.brighten(picture, cosines.basis.cosines, min(at_a_glance, tried.best.error))
+    return followed
+
+
+def _cycle(bench: Workbench, cosines: InBand, rises: tuple[float, ...], rival: float) -> Trial | None:
+    """The video as a cycle, if it repeats and predicts far better than a rival."""
+    repeats = find_period(cosines.solver.theta, cosines.basis, rises)
+    if repeats is None or bench.clock.spent(SEARCH_SHARE):
+        return None
+    cycle = bench.repeat(*repeats, rival)
+    if REPEATS * rival <= cycle.error < rival:
+        cycle = _or_turning(cycle, rival)
+    return cycle if cycle.error < REPEATS * rival else None
+
+
 @dataclass
 class _Tried:
     """First trials: a volume, a still and, unless patterns are clear, a smooth volume, one of changing
@@ -201,6 +225,17 @@ class _Tried:
     bright: Trial | None = None
     followed: Trial | None = None
     cycle: Trial | None = None
+
+    @property
+    def flows(self) -> bool:
+        """Whether a smooth volume outdoes one at rest so far that no other motion need be tried."""
+        if self.smooth is None or not self.much_moves(self.volume):
+            return False
+        return self.smooth.error < OUTDONE * self.volume.error
+
+    def much_moves(self, volume: Trial) -> bool:
+        """Whether a still is far from a volume: else a flash before a still may be all that changes."""
+        return self.plain.error >= FAR * volume.error
 
     @property
     def best(self) -> Trial:
@@ -226,26 +261,19 @@ def _search(bench: Workbench, tried: _Tried, trials: int, rival: float) -> Trial
 
     Of candidates that are far from the error of a ``rival``, only the first trials are made.
     """
-    plain = still = tried.plain
-    volume = _best_volume(bench, tried, rival)
     smooth = tried.smooth or bench.attempt(bench.fitting(SMOOTH), FIRST_ITERATIONS)
+    volume = tried.volume if tried.flows else _best_volume(bench, tried, min(rival, smooth.error))
+    if tried.much_moves(volume) and smooth.error < min(FLOWS * volume.error, FAR * rival):
+        return learn_spectrum(smooth)
+    plain = still = tried.plain
     bright = tried.bright
     # To a brightness, a flash in front of a still is the flash of everything.
     flickers = bright is not None and bench.held_out.clearly_less(bright.errors, plain.errors)
     if bright is not None and flickers and bright.error < BRIGHTER * volume.error:
         volume = bright
     # Where much moves, a still is not searched further, and is no ground for a change.
-    if plain.error < FAR * volume.error:
-        explains = plain.error < AT_REST
-        merge = bench.given.options.spatial_merge
-        still = best_still(plain, trials, merge=merge) if explains else bench.climb(plain, trials)
-        if not bench.clock.spent(SEARCH_SHARE):
-            like = weighted_like(still, bench.fitting(VOLUME))
-            candidate = replace(like, change=True)
-            if not volume.candidate.period_frames:  # else it follows its own cycle
-                candidate = candidate.with_path_of(volume.candidate)
-            change = change_bench(bench, still).attempt(candidate, FIRST_ITERATIONS)
-            volume = min((volume, change), key=_error)
+    if not tried.much_moves(volume):
+        still, volume = _with_change(bench, plain, volume, trials)
     if volume.error < FAR * rival:
         volume = volume.bench.climb(volume, trials)
         if volume.candidate.brightness:
@@ -261,9 +289,23 @@ def _search(bench: Workbench, tried: _Tried, trials: int, rival: float) -> Trial
     flows = smooth.error < SMOOTHER * volume.error and bench.held_out.clearly_less(
         smooth.errors, still.errors
     )
-    moving = smooth if flows else volume
+    moving = learn_spectrum(smooth) if flows else volume
     most = 1 - GAIN_OF_WEAKER if moving.candidate.change else MOVING
     return moving if moving.error < most * still.error else still
+
+
+def _with_change(bench: Workbench, plain: Trial, volume: Trial, trials: int) -> tuple[Trial, Trial]:
+    """The best still, and the better one of a volume and of a change relative to that still."""
+    explains = plain.error < AT_REST
+    merge = bench.given.options.spatial_merge
+    still = best_still(plain, trials, merge=merge) if explains else bench.climb(plain, trials)
+    if bench.clock.spent(SEARCH_SHARE):
+        return still, volume
+    candidate = replace(weighted_like(still, bench.fitting(VOLUME)), change=True)
+    if not volume.candidate.period_frames:  # else it follows its own cycle
+        candidate = candidate.with_path_of(volume.candidate)
+    change = change_bench(bench, still).attempt(candidate, FIRST_ITERATIONS)
+    return still, min((volume, change), key=_error)
 
 
 def _best_volume(bench: Workbench, tried: _Tried, rival: float) -> Trial:
@@ -291,7 +333,8 @@ def _following(volume: Trial, rival: float) -> Trial | None:
             if best.error <= FOLLOWED * volume.error:
                 # The rim of a picture whose sides are 1 moves by π turns.
                 sides = [np.pi * abs(turn) for turn in candidate.rotation[:1]] or map(abs, candidate.drift)
-                volume = found = _along(best, max(sides))
+                outdone = rival < OUTDONE * best.error
+                volume = found = best if outdone else _along(best, max(sides))
     return found
 
 

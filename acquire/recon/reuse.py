@@ -18,6 +18,7 @@ from acquire.recon.candidates import LARGEST_WEIGHT, STILL, WEIGHT_STEP, Candida
 from acquire.recon.cycle import FEWEST_CYCLES
 from acquire.recon.estimates import Preferred
 from acquire.recon.result import EXPLAINED
+from acquire.recon.spectrum import learn_spectrum
 from acquire.recon.workbench import FIRST_ITERATIONS, NEXT_ITERATIONS, SEARCH_SHARE
 
 if TYPE_CHECKING:
@@ -39,7 +40,8 @@ class Choice:
     ``prior`` is that of a candidate, or `COSINES_PRIOR`, of which only the number is handed over.
     ``brightness`` is the number of cosines of the whole scene's brightness, 0 if that is constant,
     ``period_frames`` that of a cycle, ``drift`` a volume's velocity in sides of the picture per frame, and
-    ``rotation`` a cycle's turn, or a volume's with its turns per frame; the next part fits them to its lines.
+    ``rotation`` a cycle's turn, or a volume's with its turns per frame; the next part fits them to its lines,
+    and it learns a spectrum of its own if that of a smooth volume was ``learned``.
     """
 
     prior: str
@@ -54,6 +56,7 @@ class Choice:
     ground: float = 0.0
     drift: tuple[float, ...] = ()
     rotation: tuple[float, ...] = ()
+    learned: bool = False
 
     @classmethod
     def of(cls, result: Reconstruction) -> Self | None:
@@ -81,6 +84,7 @@ class Choice:
             ground=found.get("ground", 0.0),
             drift=tuple(each / len(result.video) for each in found.get("drift", ())),
             rotation=_times_turns(per_frame, found.get("rotation", ())),
+            learned=bool(found.get("learned")),
         )
 
     def fits(self, error: float, noise: float) -> bool:
@@ -146,20 +150,28 @@ def reuse_choice(bench: Workbench, trials: int) -> Estimate | None:
         bright = bench.brighten(bench.video(still)[0].clip(0), choice.brightness, still.error)
         if bright is None or not bright.error < still.error:
             return None
-    moving = bench.attempt(choice.candidate(frames), FIRST_ITERATIONS, bright)
+    moving = _moving(bench, choice, bright)
+    best = moving if bench.held_out.clearly_less(moving.errors, still.errors) else still
+    return bench.finish(_strengthened(best)) if choice.fits(best.error, noise) else None
+
+
+def _moving(bench: Workbench, choice: Choice, start: Trial | None) -> Trial:
+    """A video with the choice handed over, whose path, speed or spectrum is fitted to the lines."""
+    moving = bench.attempt(choice.candidate(bench.frames), FIRST_ITERATIONS, start)
     if choice.drift or choice.rotation:
         moving = bench.follow_path(moving)
     if choice.period_frames:
         # What was handed over had more iterations.
         moving = bench.follow_speed(moving)
         moving = bench.attempt(moving.candidate, NEXT_ITERATIONS, moving)
-    best = moving if bench.held_out.clearly_less(moving.errors, still.errors) else still
-    return bench.finish(_strengthened(best)) if choice.fits(best.error, noise) else None
+    return learn_spectrum(moving) if choice.learned else moving
 
 
 def _strengthened(best: Trial) -> Trial:
     """The trial with the largest weight that does not worsen its prediction."""
     clock = best.bench.clock
+    if best.candidate.learned:  # and so is what takes the place of a weight
+        return best
     while not clock.spent(SEARCH_SHARE) and best.candidate.weight * WEIGHT_STEP <= LARGEST_WEIGHT:
         stronger = replace(best.candidate, weight=rounded(best.candidate.weight * WEIGHT_STEP))
         found = best.bench.attempt(stronger, NEXT_ITERATIONS, best)

@@ -75,7 +75,7 @@ class VolumeTv:
 
     def prox(self, frames: Array, weight: float | Array) -> Array:
         """argmin_θ ½‖θ − frames‖² + weight·TV₃(Dᵀ·θ) for coefficients (K, row, column); one weight."""
-        xp, weight = namespace(frames), _one(weight)
+        xp, weight = namespace(frames), one_weight(weight)
         if weight < SMALLEST_WEIGHT:
             return frames
         count = frames.shape[0]
@@ -144,7 +144,7 @@ class VolumeTv:
         return total
 
 
-def _one(weight: float | Array) -> float:
+def one_weight(weight: float | Array) -> float:
     """A weight as a number; it may be an array of one."""
     return weight if isinstance(weight, float) else float(namespace(weight).max(weight))
 
@@ -152,36 +152,3 @@ def _one(weight: float | Array) -> float:
 def _axes(scales: tuple[float, float, float]) -> tuple[tuple[int, float], ...]:
     """Axes of a volume (t, row, column) in the order of the dual's parts, with their scales."""
     return tuple(zip((1, 2, 0), scales, strict=True))
-
-
-class Smooth:
-    """Quadratic penalty of second differences along rows, columns and time: a prior for flames and fog.
-
-        weight/2·‖(∂²/∂row² + ∂²/∂column² + (μ·∂/∂t)²)·x‖²
-
-    In cosines of space and time, it is a factor for each coefficient (Wiener's filter).
-    """
-
-    def __init__(self, pace: float = 1.0) -> None:
-        if not 0 <= pace < math.inf:
-            raise UsageError(f"a smooth volume cannot have pace {pace}", possible="a number of at least 0")
-        self.pace = pace
-        self._cosines: tuple[Array, Array] | None = None
-        """The cosines of a frame's side (n′, n′), and (k_r² + k_c² + μ²·k_t²)² for each coefficient."""
-
-    def prox(self, frames: Array, weight: float | Array) -> Array:
-        """argmin_θ ½‖θ − frames‖² + weight/2·Σ (k_r² + k_c² + μ²·k_t²)²·θ̂² for θ (K, row, column)."""
-        xp, weight = namespace(frames), _one(weight)
-        if self._cosines is None:
-            count, side, _ = frames.shape
-            # Frequencies are in radians per pixel; the time axis counts as long as a side, whatever its
-            # instants.
-            k = np.square(np.pi * np.arange(side) / side)
-            t = np.square(self.pace * np.pi * np.arange(count) / side)
-            square = np.square(t[:, None, None] + k[:, None] + k)
-            matrix = TemporalBasis(side, side, Arrays(dtype="float64")).matrix()
-            made = [xp.asarray(each, dtype=frames.dtype, device=frames.device) for each in (matrix, square)]
-            self._cosines = made[0], made[1]
-        along, square = self._cosines
-        spectrum = along @ frames @ along.T
-        return along.T @ (spectrum / (1 + weight * square)) @ along if weight else xp.asarray(frames)

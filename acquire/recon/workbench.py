@@ -20,6 +20,7 @@ from acquire.recon.band import segment_operator
 from acquire.recon.basis import CyclicBasis, TemporalBasis, resized
 from acquire.recon.brightness import fit_brightness
 from acquire.recon.candidates import CALM, CYCLE, USUAL_ENERGY, VOLUME, Candidate, parameters
+from acquire.recon.chosen import ChosenEstimate
 from acquire.recon.cycle import FEWEST_HARMONICS, better_speed, most_harmonics
 from acquire.recon.drift import drifting
 from acquire.recon.rotation import turning
@@ -292,12 +293,21 @@ class Workbench:
         cosines = min(candidate.coefficients, self.frames)
         return replace(candidate, coefficients=cosines, weight=larger * candidate.weight)
 
-    def attempt(self, candidate: Candidate, iterations: int, start: Trial | None = None) -> Trial:
-        """Solve a candidate from ``start`` for this many iterations, or as many as there is time for."""
+    def attempt(
+        self,
+        candidate: Candidate,
+        iterations: int,
+        start: Trial | None = None,
+        denoiser: Denoiser | None = None,
+    ) -> Trial:
+        """Solve a candidate from ``start`` for this many iterations, or as many as there is time for.
+
+        ``denoiser`` is one that depends on more than the candidate.
+        """
         basis = candidate.basis(self.frames, self.problem.arrays)
         brightness = self._brightness if candidate.brightness else None
         operator = self._operator(basis, brightness)
-        shape, denoiser = (basis.count, self._side, self._side), candidate.denoiser()
+        shape, denoiser = (basis.count, self._side, self._side), denoiser or candidate.denoiser()
         admm = Admm(
             self.problem.masked(operator),
             self.problem.used_samples,
@@ -443,58 +453,3 @@ class Workbench:
         if brightness is not None:
             code = code * np.repeat(brightness, self._merges[1])[: len(code)]
         return segment_operator(segment, basis, *self._merges, code=code)
-
-
-class ChosenEstimate:
-    """Estimate of the candidate that was chosen."""
-
-    def __init__(self, bench: Workbench, trial: Trial) -> None:
-        self._bench, self._trial = bench, trial
-        self.held_out_error: float | None = trial.error
-
-    def predict(self) -> NDArray[Any]:
-        return self._bench.predict(self._trial)
-
-    def video(self) -> NDArray[Any]:
-        return self._bench.video(self._trial)
-
-    def facts(self) -> dict[str, Any]:
-        chosen, basis = asdict(self._trial.candidate), self._trial.basis
-        del chosen["coefficients"]
-        chosen["temporal_coefficients"] = basis.cosines
-        if isinstance(basis, CyclicBasis):
-            chosen["harmonics"] = basis.harmonics
-        return chosen | {"candidates": self._bench.record}
-
-    def continue_with(self, problem: Problem, heavier: float = 1.0, *, still: bool = False) -> ContinuedTrial:
-        background = self._bench.still if still else None
-        return ContinuedTrial(
-            self._bench,
-            _with_problem(self._trial, problem, heavier),
-            None if background is None else _with_problem(background, problem, heavier),
-        )
-
-
-class ContinuedTrial:
-    """A trial that continues, and the still that it is a change of, which is most of the picture."""
-
-    def __init__(self, bench: Workbench, trial: Trial, still: Trial | None) -> None:
-        self._bench, self._trial, self._still = bench, trial, still
-
-    def step(self) -> None:
-        self._trial.admm.step()
-        if self._still is not None:
-            self._still.admm.step()
-
-    def video(self) -> NDArray[Any]:
-        if self._still is None:
-            return self._bench.video(self._trial)
-        bench = self._bench.with_problem(self._bench.problem, still=self._still)
-        return bench.video(replace(self._trial, bench=bench))
-
-
-def _with_problem(trial: Trial, problem: Problem, heavier: float) -> Trial:
-    own = trial.bench.problem
-    problem = replace(problem, known_lines=own.known_lines, robust_weight=own.robust_weight)  # of its bench
-    operator = problem.masked(trial.operator)
-    return replace(trial, admm=trial.admm.with_problem(operator, problem.used_samples, heavier))

@@ -18,6 +18,8 @@
     string    a string vibrates, with an overtone
     piston    a crank moves a piston
     wheel     a textured wheel turns beside the middle before textured ground
+    waves     waves on deep water, which run in all directions
+    smoke     smooth texture is stirred by vortices and drifts
 
 Sizes are fractions of the picture and times fractions of the span, so that a scene is the same at any M, S
 and L_R; only the lamps have frequencies in sub-steps. The noise is that of a 12-bit camera whose brightest
@@ -367,6 +369,40 @@ def wheel(s: Canvas) -> Callable[[int, float], Image]:
     return frame
 
 
+def waves(s: Canvas) -> Callable[[int, float], Image]:
+    """Waves on deep water, whose frequencies are in proportion to the root of their number across."""
+    k, angle, phase = s.rng.uniform([2, 0, 0], [9, 2 * np.pi, 2 * np.pi], (40, 3)).T
+    along = [n * (np.cos(each) * s.x + np.sin(each) * s.y) for n, each in zip(k, angle, strict=True)]
+    amplitude = 0.8 / k
+
+    def frame(_t: int, tau: float) -> Image:
+        turns = [at - 1.6 * np.sqrt(n) * tau for n, at in zip(k, along, strict=True)]
+        height = sum(
+            a * np.cos(2 * np.pi * each + p) for a, each, p in zip(amplitude, turns, phase, strict=True)
+        )
+        return np.asarray(0.5 + 0.35 * np.tanh(height), np.float32)
+
+    return frame
+
+
+def smoke(s: Canvas) -> Callable[[int, float], Image]:
+    """Smoke that three vortices stir while it drifts."""
+    texture = gaussian_filter(s.rng.standard_normal((2 * s.n, 2 * s.n)), 0.04 * s.n, mode="wrap")
+    vortices = s.rng.uniform([0.3, 0.3, -1.2 * np.pi], [0.7, 0.7, 1.2 * np.pi], (3, 3))
+
+    def frame(_t: int, tau: float) -> Image:
+        y, x = s.y, s.x
+        for row, column, turn in vortices:
+            dy, dx = y - row, x - column
+            angle = turn * tau * np.exp(-(dy**2 + dx**2) / 2 / 0.15**2)
+            y = row + np.cos(angle) * dy - np.sin(angle) * dx
+            x = column + np.sin(angle) * dy + np.cos(angle) * dx
+        density = map_coordinates(texture, [(y + 0.3 * tau) * s.n, x * s.n], order=1, mode="grid-wrap")
+        return np.asarray(0.05 + 0.9 / (1 + np.exp(-1.5 * density / texture.std())), np.float32)
+
+    return frame
+
+
 SCENES = {
     f.__name__: f
     for f in (
@@ -388,6 +424,8 @@ SCENES = {
         string,
         piston,
         wheel,
+        waves,
+        smoke,
     )
 }
 

@@ -111,8 +111,8 @@ def test_text_that_scrolls_is_followed(monkeypatch: pytest.MonkeyPatch) -> None:
     rows, columns = found.parameters["drift"]
     assert abs(rows) < 0.03
     assert -0.6 < columns < -0.3
-    # A short budget has time for it: only a volume, a still and cosines come first.
-    assert found.parameters["candidates"][3]["drift"]
+    # A short budget has time for it: only a volume, a still, cosines and a smooth volume come first.
+    assert any(each.get("drift") for each in found.parameters["candidates"][:6])
     # A next range of half the length moves half as far.
     choice = Choice.of(found)
     assert choice is not None

@@ -9,7 +9,8 @@ from scipy.fft import dct, dctn, idct
 from skimage.restoration import denoise_tv_chambolle
 
 from acquire.errors import UsageError
-from acquire.recon.volume import Smooth, VolumeTv
+from acquire.recon.smooth import Smooth
+from acquire.recon.volume import VolumeTv
 
 
 def of_instants(prior: VolumeTv | Smooth, volume: np.ndarray, weight: float) -> np.ndarray:
