@@ -21,7 +21,7 @@ from acquire.simulate import simulate
 Cli = Callable[..., Any]
 LATE = {"rich", "pydantic", "numpy", "zarr", "acquire.config", "acquire.store"}
 """What the help of no command needs."""
-LIBRARIES = {"awscrt", "multiprocessing", "numcodecs", "numpy", "pydantic", "rich", "scipy", "zarr"}
+LIBRARIES = {"multiprocessing", "numcodecs", "numpy", "pydantic", "rich", "scipy", "zarr"}
 """What a list of recordings does without."""
 PROCESSOR_S = 2.0
 """Ten times what is expected, for a slow machine: what is loaded is asked exactly."""
