@@ -310,7 +310,7 @@ def show(
         carried = calibration_of(open_recording(calibration))
         if carried is None:
             raise PlaceError(
-                f"{calibration} carries no calibration", possible="a calibration, or a recording with one"
+                f"{calibration} holds no calibration", possible="a calibration, or a recording with one"
             )
         known = carried
     else:
