@@ -283,7 +283,7 @@ def veil(
 
 def show(
     calibration: Annotated[
-        str, typer.Argument(metavar="CAL", help="Calibration, or a recording that carries one.")
+        str, typer.Argument(metavar="CAL", help="Calibration, or a recording that holds one.")
     ],
     out: Annotated[
         Path | None,
