@@ -39,9 +39,9 @@ def rig_text() -> str:
         (b"\xff\xfex = 1", "byte 0 is not UTF-8"),
         (b"x = 1\0", "not TOML"),
         (b"#" * (MOST_FILE_BYTES + 1), "larger than"),
-        (b"a = 1\n" + b"\n".join(b"k%d = 1" % i for i in range(5000)), " error(s)"),
+        (b"a = 1\n" + b"\n".join(b"k%d = 1" % i for i in range(5000)), " error"),
         (b'x = "' + b"y" * 50_000 + b'"', "x"),
-        (b'"' + b"y" * 50_000 + b'" = 1', " error(s)"),
+        (b'"' + b"y" * 50_000 + b'" = 1', " error"),
     ],
 )
 def test_malformed_files_are_refused(

@@ -25,11 +25,11 @@ from acquire.codes import ConstantCode
 from acquire.config.recording import usual_chunk_lines, usual_tag_chunks
 from acquire.lines import ARMS, LineTable, TaggedBlock
 from acquire.store import RecordingSpec, RecordingWriter, RunCondition, open_recording
-from acquire.store.codecs import crc32c, encode
+from acquire.store.codecs import encode
 from acquire.store.files import DISK
 from acquire.store.pages import PAGE, aligned_bytes, open_direct, page_up
 from acquire.store.retention import shard_files
-from acquire.store.shape import CODECS, Codec, shard_key
+from acquire.store.shape import CODECS, Codec, crc32c, shard_key
 from tools.results import Run, add_option, recorded
 
 PIXELS, SHARD_CHUNKS, SUBSTEPS = 4640, 240, 3

@@ -19,7 +19,8 @@ from acquire.clock import ClockFit
 from acquire.lines import ARMS, LineBlock
 from acquire.pattern import Pattern
 from acquire.store import RecordingWriter
-from acquire.store.codecs import crc32c, encode
+from acquire.store.codecs import encode
+from acquire.store.shape import crc32c
 from acquire.stream.ring import Ring, RingShape
 from acquire.stream.tagger import Tagger
 

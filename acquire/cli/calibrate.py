@@ -283,7 +283,7 @@ def veil(
 
 def show(
     calibration: Annotated[
-        str, typer.Argument(metavar="CAL", help="Calibration, or a recording that carries one.")
+        str, typer.Argument(metavar="CAL", help="Calibration, or a recording that holds one.")
     ],
     out: Annotated[
         Path | None,
@@ -310,7 +310,7 @@ def show(
         carried = calibration_of(open_recording(calibration))
         if carried is None:
             raise PlaceError(
-                f"{calibration} carries no calibration", possible="a calibration, or a recording with one"
+                f"{calibration} holds no calibration", possible="a calibration, or a recording with one"
             )
         known = carried
     else:

@@ -20,9 +20,11 @@ _CHECKS = ("exists", "writable", "resolve_path", "allow_dash", "path_type", "cli
 
 def range_in_words(least: float | None, most: float | None) -> str:
     """Return `1 to 9`, `1 or more` or `9 or less`; an empty text without limits."""
+    # In full: `1.04858e+06` is neither the limit nor what anybody would type.
+    low, high = ("" if limit is None else f"{limit:.15g}" for limit in (least, most))
     if least is None:
-        return "" if most is None else f"{most:g} or less"
-    return f"{least:g} or more" if most is None else f"{least:g} to {most:g}"
+        return high and f"{high} or less"
+    return f"{low} or more" if most is None else f"{low} to {high}"
 
 
 class Quick:

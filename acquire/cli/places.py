@@ -34,8 +34,7 @@ def given_path(text: str) -> str:
 
 def local_path(text: str) -> Path:
     """Parse a path on this machine. Raises UsageError for an empty one, and a URL of anything else."""
-    given_path(text)
-    if "://" in text and not text.startswith("file://"):
+    if _is_elsewhere(given_path(text)):
         raise UsageError(
             f"{text} is a URL, but this command changes a recording in place, which a remote store does not "
             "allow",
@@ -55,8 +54,18 @@ def calibration_place(text: str) -> str:
 
 
 def local_directory(text: str) -> Path:
-    """Parse a directory. Raises UsageError for an empty path."""
-    return Path(given_path(text))
+    """Parse a directory on this machine. Raises UsageError for an empty path, and a URL of anything else."""
+    if _is_elsewhere(given_path(text)):
+        raise UsageError(
+            f"{text} is a URL, but `acquire ls` lists a directory of this machine",
+            possible="a path on this machine",
+            hint=f"acquire info {text.rstrip('/')}/NAME.zarr describes one",
+        )
+    return Path(text.removeprefix("file://"))
+
+
+def _is_elsewhere(text: str) -> bool:
+    return "://" in text and not text.startswith("file://")
 
 
 @contextlib.contextmanager

@@ -30,7 +30,7 @@ def explain_calibration(
 
     if chosen is None:
         raise UsageError(
-            f"{recording} carries no calibration to be explained",
+            f"{recording} holds no calibration to explain",
             possible="--calibration NAME.zarr",
             hint="acquire calibrate, to make one",
         )

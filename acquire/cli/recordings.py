@@ -116,7 +116,7 @@ def verify(recording: PlaceArgument, json: JsonFlag = False) -> None:
     """Read a whole recording and check that every line is intact, and that numbering, gaps and ledger agree.
 
     If something is damaged, the command lists it and the exit code is 6. Lines that are flagged as missing
-    are no damage: they were lost before, or recover has flagged them, and info lists them.
+    do not count as damage: they were lost before, or recover has flagged them, and info lists them.
 
     Example: [bold]acquire verify run.zarr[/]
     """

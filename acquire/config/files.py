@@ -76,7 +76,7 @@ def find_again(path: Path) -> None:
     if not path.is_file():
         raise ConfigError(
             f"rig file {shown(str(path))}, with which the service was started, {_why_no_file(path)}: "
-            "the service goes on with what it has read",
+            "the service continues with what it has read",
             hint="put the file back, or restart the service with another --config while it is idle",
         )
 

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 from acquire.config.variants import GROUP_KEY
 from acquire.plugins import GROUPS
-from acquire.text import own_words, shortened, shown
+from acquire.text import counted, own_words, shortened, shown
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -32,7 +32,7 @@ def explained(error: ValidationError, model: type[BaseModel], path: Path | str) 
             len(place) > len(item["loc"]) and place[: len(item["loc"])] == item["loc"] for place in places
         )
     ]
-    lines = [f"{path}: {len(findings)} error(s)"]
+    lines = [f"{path}: {counted(len(findings), 'error')}"]
     for item in findings[:MOST_LISTED]:
         keys, allowed, secret = _locate(model, item["loc"])
         key = shortened(".".join(keys)) or "(file)"

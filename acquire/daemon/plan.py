@@ -44,7 +44,7 @@ class Run:
     ) -> None:
         """Prepare a run without touching a device; ``choose`` finds the codec if that is ``auto``.
 
-        ``devices`` are told of those that were armed.
+        ``devices`` remembers those that were armed.
 
         Raises UsageError for a configuration, or calibration, that cannot work.
         """

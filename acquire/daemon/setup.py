@@ -26,7 +26,7 @@ LIBRARIES = (
     "numpy",
     "zarr",
     "numcodecs",
-    "awscrt",
+    "fastcrc",
     "pydantic",
     "fastapi",
     "uvicorn",

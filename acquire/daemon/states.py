@@ -14,9 +14,9 @@
 
 ARM, START, MARK (while armed, recording or draining, without a change of state), STOP and DISARM are
 commands. The others come from the capture path: FULL (the line budget is recorded, or the recording ended
-early by itself), SEALED (the recording is closed, the instrument stays armed for the next), RELEASED (it is
-closed, and the devices are released, by configuration or a signal) and FAULT. Transitions that are not drawn
-are refused.
+early without a command), SEALED (the recording is closed, the instrument stays armed for the next), RELEASED
+(it is closed, and the devices are released, by configuration or a signal) and FAULT. Transitions that are not
+drawn are refused.
 """
 
 from __future__ import annotations

@@ -35,7 +35,7 @@ ROOT = Path(__file__).parents[2]
 """The root of the checkout, if the package runs from one."""
 COMPILER = "g++"
 # The extra [firmware] installs the tools; a module of such a name does not belong among installed packages.
-_WHERE = "which are in a checkout and in the source archive, but not in an installed package"
+_WHERE = "they are in a checkout and in the source archive, but not in an installed package"
 _HOW = (
     f"pip download --no-deps --no-binary=:all: tdi-acquire=={__version__}; unpack that, and "
     "pip install -e '.[firmware]' in it"
@@ -55,7 +55,7 @@ def baud(clock_hz: int) -> int:
 
 def missing() -> str | None:
     """Name the first requirement for running the gateware that is not met; None if all are."""
-    return missing_tools() if has_sources() else f"the gateware's sources, {_WHERE}"
+    return missing_tools() if has_sources() else f"its sources: {_WHERE}"
 
 
 def has_sources() -> bool:
@@ -76,7 +76,7 @@ def demand() -> None:
     """Raise UsageError, which states what to install, unless the gateware can be run here."""
     if reason := missing():
         raise UsageError(
-            f"trigger 'rtl' runs the gateware itself, which needs {reason}",
+            f"trigger 'rtl' runs the gateware itself, for which this host lacks {reason}",
             possible="trigger.driver = 'simulated', a model of the same trigger",
             hint="" if has_sources() else _HOW,
         )

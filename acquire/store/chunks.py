@@ -5,9 +5,9 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 from acquire.store.array_files import ArrayFiles
-from acquire.store.codecs import BLOSC_HEADER, check_size, crc32c, decode, stored_size
+from acquire.store.codecs import BLOSC_HEADER, check_size, decode, stored_size
 from acquire.store.refusals import shows_damage
-from acquire.store.shape import ABSENT, CRC_BYTES, index_bytes
+from acquire.store.shape import ABSENT, CRC_BYTES, crc32c, index_bytes
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

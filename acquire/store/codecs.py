@@ -11,11 +11,10 @@ from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from awscrt import checksums
 from numcodecs import blosc
 
 from acquire.errors import UsageError
-from acquire.store.shape import CODECS, CRC_BYTES
+from acquire.store.shape import CODECS, CRC_BYTES, crc32c
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -106,12 +105,6 @@ def stored_size(header: bytes, size: int, codec: Codec) -> int:
     # Without a codec there is no header: a chunk has its full size, wherever it is.
     stored = size if codec == "none" else int(struct.unpack_from("<12xI", header)[0])
     return stored + CRC_BYTES
-
-
-def crc32c(data: Buffer) -> bytes:
-    """Return the checksum as Zarr stores it: 4 bytes, little-endian."""
-    value: int = checksums.crc32c(data)
-    return value.to_bytes(CRC_BYTES, "little")
 
 
 def choose_codec(

@@ -8,10 +8,10 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 from acquire.store.chunks import DamagedChunkError
-from acquire.store.codecs import crc32c, encode
+from acquire.store.codecs import encode
 from acquire.store.pages import PAGE, page_up
 from acquire.store.refusals import shows_damage
-from acquire.store.shape import ABSENT, pack_index
+from acquire.store.shape import ABSENT, crc32c, pack_index
 
 if TYPE_CHECKING:
     from pathlib import Path

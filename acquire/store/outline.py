@@ -63,6 +63,7 @@ class Outline:
         self.arms = {arm: self._arm(arm, {name: nodes[f"{arm}/{name}"] for name in COLUMNS}) for arm in ARMS}
 
     def _arm(self, arm: str, documents: dict[str, Document]) -> ArmFiles:
+        """Return an arm by its arrays' documents; `Recording` returns one whose lines can be read."""
         files = {name: ArrayFiles(self.source, f"{arm}/{name}", found) for name, found in documents.items()}
         return ArmFiles(self.source, arm, files, self.first_line)
 

@@ -22,8 +22,8 @@ import numpy as np
 from acquire.errors import DataError
 from acquire.lines import ARMS, LineFlag
 from acquire.store import layout
-from acquire.store.codecs import check_size, crc32c, decode, encode
-from acquire.store.shape import CRC_BYTES, ArrayShape, codec_of
+from acquire.store.codecs import check_size, decode, encode
+from acquire.store.shape import CRC_BYTES, ArrayShape, codec_of, crc32c
 from acquire.text import counted
 
 if TYPE_CHECKING:

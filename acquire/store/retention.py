@@ -55,7 +55,8 @@ def hold(path: Path, first_line: int, count: int, why: str = "", disk: Disk = DI
     recording = open_recording(path)
     if recording.state == "sealed":
         raise UsageError(
-            f"{path} is sealed: its lines need not be held", possible="no hold: none of its lines are dropped"
+            f"{path} is sealed: it drops no lines, so that none need to be held",
+            hint="acquire hold is for an endless recording that is still being written",
         )
     if first_line + count <= recording.first_line:
         raise UsageError(

@@ -20,9 +20,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from acquire.store.codecs import crc32c
 from acquire.store.pages import PAGE, aligned_bytes, is_aligned, page_up
-from acquire.store.shape import ABSENT, CRC_BYTES, pack_index
+from acquire.store.shape import ABSENT, CRC_BYTES, crc32c, pack_index
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

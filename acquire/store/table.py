@@ -14,7 +14,7 @@ from numcodecs.vlen import VLenUTF8
 
 from acquire.lines import ARMS
 from acquire.store import layout
-from acquire.store.codecs import crc32c
+from acquire.store.shape import crc32c
 
 if TYPE_CHECKING:
     from collections.abc import Mapping

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 from acquire.errors import DataError
 from acquire.store.layout import PARSE_ERRORS
 from acquire.store.refusals import refusal, shows_damage
-from acquire.store.shape import CRC_BYTES, small_crc32c
+from acquire.store.shape import CRC_BYTES, crc32c
 from acquire.text import cause_in_words
 
 if TYPE_CHECKING:
@@ -99,7 +99,7 @@ class _Table:
             # The column's only chunk, which may have more rows than the root states.
             chunk = self.source.read(f"{self.name}/{column}/c/0")
             data, checksum = chunk[:-CRC_BYTES], chunk[-CRC_BYTES:]
-            if small_crc32c(data) != checksum:
+            if crc32c(data) != checksum:
                 raise ValueError("the checksum is wrong")
             if data_type == "string":
                 return _texts(data, rows)

@@ -96,7 +96,7 @@ class DiskReads:
 
 
 async def _prepare(archive: Archive, reading: DiskReads) -> None:
-    with contextlib.suppress(AcquireError):  # whoever asks for the lists is told
+    with contextlib.suppress(AcquireError):  # whoever asks for the lists gets the error
         await reading(archive.recordings)
         await reading(archive.videos)
 

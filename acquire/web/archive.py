@@ -362,7 +362,7 @@ def _arm_overview(opened: Recording, arm: str) -> NDArray[np.uint8]:
             continue
         try:
             lines, flags = stream.read("lines", start, stop), stream.read("flags", start, stop)
-        except DataError:  # its damage is told in words (`RecordingFacts.damage`), and the rest is shown
+        except DataError:  # `RecordingFacts.damage` describes it, and the rest is shown
             picture[row] = LOST_COLOUR
             continue
         no_image = (flags & NO_IMAGE) != 0

@@ -13,6 +13,7 @@ from typing import Any
 import pytest
 import typer
 
+from acquire.cli.coercion import range_in_words
 from acquire.cli.commands import BY_NAME, COMMANDS, MODULES
 from acquire.cli.usage import build
 from acquire.config import load_rig, load_scene
@@ -21,7 +22,7 @@ from acquire.simulate import simulate
 Cli = Callable[..., Any]
 LATE = {"rich", "pydantic", "numpy", "zarr", "acquire.config", "acquire.store"}
 """What the help of no command needs."""
-LIBRARIES = {"awscrt", "multiprocessing", "numcodecs", "numpy", "pydantic", "rich", "scipy", "zarr"}
+LIBRARIES = {"multiprocessing", "numcodecs", "numpy", "pydantic", "rich", "scipy", "zarr"}
 """What a list of recordings does without."""
 PROCESSOR_S = 2.0
 """Ten times what is expected, for a slow machine: what is loaded is asked exactly."""
@@ -134,3 +135,18 @@ def test_recordings_are_listed_without_array_libraries(
         assert "is not a recording: it holds no zarr.json" in listed["empty.zarr"]
         assert "zarr.json is damaged" in listed["torn.zarr"]
     assert ended.stdout.splitlines()[-1] == "loaded: []"
+
+
+@pytest.mark.parametrize(
+    ("limits", "words"),
+    [
+        ((1, 9), "1 to 9"),
+        ((64, 2**20), "64 to 1048576"),
+        ((0.001, 1e9), "0.001 to 1000000000"),
+        ((1, None), "1 or more"),
+        ((None, 9), "9 or less"),
+        ((None, None), ""),
+    ],
+)
+def test_limits_are_written_in_full(limits: tuple[float | None, float | None], words: str) -> None:
+    assert range_in_words(*limits) == words

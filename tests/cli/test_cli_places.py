@@ -316,3 +316,12 @@ def test_a_port_that_does_not_exist_is_named_with_its_option(cli: Cli) -> None:
     answer = cli("web", "--link", "--port", 99_999)
     assert answer.code == 2
     assert "--port 99999: " in answer.err
+
+
+def test_what_lists_a_directory_takes_no_url_of_another_machine(cli: Cli, tmp_path: Path) -> None:
+    answer = cli("ls", "s3://bucket/recordings/")
+    assert (
+        "s3://bucket/recordings/ is a URL, but `acquire ls` lists a directory of this machine" in answer.err
+    )
+    assert "acquire info s3://bucket/recordings/NAME.zarr describes one" in answer.err
+    assert "no recordings" in cli("ls", f"file://{tmp_path}").out

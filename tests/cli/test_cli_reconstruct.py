@@ -275,7 +275,7 @@ def test_a_video_is_written_to_a_url_and_rendered_from_it(cli: Cli, recording: P
         (("--voxels", "3"), "NMxTM"),
         (("--lines", 50, "--to", "1ms"), "--from and --to"),
         (("--segment", ":2x2", "--segment", "5:2x2"), "only the last segment"),
-        (("--segment", "0:6x20"), "--segment: 1 error(s)\n  segments.0.lines = 0"),
+        (("--segment", "0:6x20"), "--segment: 1 error\n  segments.0.lines = 0"),
         (("--plan", "nothing.toml"), "does not exist"),
         (("--ends", "half"), "trusted, whole"),
         (("--lines", 5), "more than 12 lines"),

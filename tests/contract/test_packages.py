@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 
 import acquire
+from tools.install_size import installed
 from tools.packages import ROOT, Packages, faults, files_of_sdist, make
 
 
@@ -50,3 +51,12 @@ def test_the_version_is_written_in_one_place(made: Packages) -> None:
     pythons = re.findall(r"Python :: (3\.\d+)$", "\n".join(facts.get_all("Classifier", [])), re.MULTILINE)
     assert pythons == ["3.11", "3.12", "3.13"]
     assert facts["Requires-Python"] == f">={pythons[0]}"
+
+
+def test_a_capture_host_installs_no_more_than_it_needs() -> None:
+    """At most 170 MiB, of which numpy and numcodecs are 103; see tools/MEASURED.md for what `du` shows."""
+    sizes = installed()
+    assert sum(size.total for size in sizes.values()) / 2**20 < 170, sizes
+    assert not {"scipy", "numba", "matplotlib", "llvmlite", "pillow", "jinja2"} & set(sizes)
+    # What every capture host has: the list names what is really followed.
+    assert {"tdi-acquire", "numpy", "zarr", "numcodecs", "fastapi", "typer", "fastcrc"} <= set(sizes)

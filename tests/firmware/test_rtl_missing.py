@@ -27,3 +27,12 @@ def test_without_yosys_the_reason_is_given(monkeypatch: pytest.MonkeyPatch, tmp_
     monkeypatch.setenv("PATH", str(tmp_path))
     monkeypatch.setattr(acquire.sim.rtl, "find_spec", lambda name: None)
     assert firmware.cxxrtl.missing() == "Amaranth (pip install 'tdi-acquire[firmware]')"
+
+
+def test_an_installed_package_says_where_the_gateware_is(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setattr(acquire.sim.rtl, "ROOT", tmp_path)
+    with pytest.raises(UsageError, match="this host lacks its sources: they are in a checkout") as refused:
+        acquire.sim.rtl.demand()
+    assert "pip download --no-deps" in refused.value.hint
