@@ -41,8 +41,8 @@ MOST_LINES = 8192
 SIDE = 5
 """Side of a window in coarse pixels."""
 AROUND = 1
-"""Coarse pixels around a window that have to be black, too, since a blur carries light across an edge. Without
-them the sheet's veil was found up to 0.9 % too high with a blur of 1.3 fine pixels."""
+"""Coarse pixels around a window that have to be black, too, since a blur carries light across an edge.
+Without them the sheet's veil was found up to 0.9 % too high with a blur of 1.3 fine pixels."""
 BLACK = 0.01
 """Share of the windows that has to be black; a square of twice SIDE has as many in 64 × 64 pixels."""
 AS_BLACK = 2.0
