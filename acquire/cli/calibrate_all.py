@@ -24,8 +24,11 @@ if TYPE_CHECKING:
 
 TRIES = 3
 """Attempts at a step if somebody is there to correct the cause of a failure."""
-SHOWS = {"psf": "the optics' blur", "veil": "the lens's veil"}
-"""What a target may or may not show."""
+MISSING = {
+    "psf": "the target does not show the optics' blur",
+    "veil": "the target does not show the lens's veil",
+}
+"""What a target need not show."""
 INSTEAD = {
     "psf": "nothing corrects it, unless it was measured before; acquire calibrate sheet draws a target that "
     "shows it, and acquire calibrate all --only psf measures it alone",
@@ -196,7 +199,7 @@ def _tried(
     try:
         more = save_finding(out, exposure, evaluate)
     except UsageError as error:
-        text = f"the target does not show {SHOWS[name]}: {error.message}; {INSTEAD[name]}"
+        text = f"{MISSING[name]}: {error.message}; {INSTEAD[name]}"
         # kept in the calibration, so that whoever reads it later knows what is missing, and why
         last = replace(found[-1], warnings=(*found[-1].warnings, text))
         save_finding(out, exposure, lambda _: last)
