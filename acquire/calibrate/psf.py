@@ -57,8 +57,8 @@ STRAIGHT = 0.02
 NOISES = 1.3
 """The same relative to the image's noise, which alone gives 1."""
 ALIKE = 0.3
-"""Largest RMS residual of an edge before it is fitted, relative to its step. Of 1500 edges that a fit accepted,
-few had more; of windows with dots, whose fits take most of the time, half had."""
+"""Largest RMS residual of an edge before it is fitted, relative to its step. Of 1500 edges that a fit
+accepted, few had more; of windows with dots, whose fits take most of the time, half had."""
 LARGEST_SIGMA = 4.0
 """In fine pixels; a wider edge extends beyond its window."""
 FEWEST = 6
@@ -68,7 +68,7 @@ SLANTED = 0.7
 SHAPE = 0.04
 """Uncertainty of σ², in fine pixels², because a blur is not exactly Gaussian nor an edge exactly a step."""
 WELL = 0.06
-"""Uncertainty of each variance with which no other size of windows is tried: σ = 0.6 is then right to 0.05."""
+"""Uncertainty of the variances with which no other size of windows is tried: σ = 0.6 is right to 0.05."""
 SURE = 0.1
 """Largest uncertainty of each axis's variance, in fine pixels²: σ = 0.6 then has an uncertainty of 0.08."""
 
