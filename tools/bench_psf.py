@@ -44,7 +44,8 @@ class Blurred(Drawn):
     @property
     def widths(self) -> tuple[float, float]:
         """σ of arms A and B."""
-        a, b = np.random.default_rng(self.seed + 3000).uniform(0, 1.5, 2).tolist()
+        # 0.01 is the simulator's least
+        a, b = np.random.default_rng(self.seed + 3000).uniform(0, 1.5, 2).clip(0.01).tolist()
         return a, b
 
     @property
