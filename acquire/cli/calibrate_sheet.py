@@ -52,7 +52,7 @@ def sheet(
 
     Example: [bold]acquire calibrate sheet --out target.svg --field-mm 60 --config rig.toml[/]
     """
-    from acquire.calibrate.sheet import Sheet, svg
+    from acquire.calibrate.sheet import svg
     from acquire.config import load_rig
     from acquire.store.delivery import whole_file
     from acquire.store.refusals import refused
@@ -64,15 +64,15 @@ def sheet(
     if suffix == ".svg":
         data = svg(geometry.substeps, geometry.stages, field_mm).encode("utf-8")
     else:
-        data = _png(Sheet(geometry.substeps), n)
+        data = _png(geometry.substeps, n)
     with whole_file(out) as part, refused(out, "written"):
         part.write_bytes(data)
     facts = {"sheet": str(out), "fine pixels": n, "a fine pixel": f"{field_mm / n:.3g} mm"}
     (print_json if json else print_facts)(facts)
 
 
-def _png(sheet: object, size: int) -> bytes:
-    """Return a picture of the field with whole pixels per fine pixel."""
+def _png(substeps: int, size: int) -> bytes:
+    """Return a picture of the field, with a whole number of pixels per fine pixel."""
     import io
 
     import numpy as np
@@ -80,9 +80,8 @@ def _png(sheet: object, size: int) -> bytes:
 
     from acquire.calibrate.sheet import FINER, Sheet
 
-    assert isinstance(sheet, Sheet)
     finer = max(1, min(FINER, LARGEST_PIXELS // size))
-    light = Sheet(sheet.substeps).picture(size * finer, finer=max(1, FINER // finer), scale=finer)
+    light = Sheet(substeps).picture(size * finer, finer=max(1, FINER // finer), scale=finer)
     file = io.BytesIO()
     Image.fromarray(np.rint(255 * light).astype(np.uint8)).save(file, "PNG", optimize=True)
     return file.getvalue()
