@@ -5,20 +5,23 @@ Usage: python -m tools.bench_calibrate [--instruments 5] [--seed 1] [--lines 102
 Every instrument has shot noise, read noise, dark current, columns that differ in gain and offset, ambient
 light, an uneven beam splitter, and an arm B that is shifted, rotated and magnified; every second one has a
 point spread. Dark, flat and target are recorded with ``--lines`` lines each and calibrated as `acquire
-calibrate` does; the target consists of random dots of 2 to 6 fine pixels. In every second instrument the
-flat's light ends at the field's edge. Then a scene of three lamps of random shapes, positions and frequencies
-is reconstructed from 263 lines (voxels 3 x 1): as recorded, calibrated, with the instrument's true properties
-instead of measured ones (exact_db: what no better calibration would exceed, but for chance), from lines with
-only the same noise, and from lines that also have the splitter's unequal shares and the ambient light,
-exactly known (known_db): no calibration takes away the noise that these add. Columns: errors of shift (fine
-pixels), rotation (degrees), DN per electron (%), gains and offsets in the worst column that the optics do not
-hide (%, DN; gain_inner: without the outermost columns, where light lost at the field's edge is mistaken for
-gain), the splitter (%), PSNR in dB, seconds.
+calibrate all` does. The target (--target) is the sheet that `acquire calibrate sheet` draws, askew, with
+black dark parts (sheet: also measures blur and veil), printed on paper, whose black reflects 4 % (paper: blur
+only), unsharp itself by 0.5 fine pixels (soft), or random dots of 2 to 6 fine pixels (dots: neither). In
+every second instrument the flat's light ends at the field's edge. Then a scene of three lamps of random
+shapes, positions and frequencies is reconstructed from 263 lines (voxels 3 x 1): as recorded, calibrated,
+with the instrument's true properties instead of measured ones (exact_db: what no better calibration would
+exceed, but for chance), from lines with only the same noise, and from lines that also have the splitter's
+unequal shares and the ambient light, exactly known (known_db): no calibration takes away the noise that these
+add. Columns: errors of shift (fine pixels), rotation (degrees), DN per electron (%), gains and offsets in the
+worst column that the optics do not hide (%, DN; gain_inner: without the outermost columns, where light lost
+at the field's edge is mistaken for gain), the splitter (%), PSNR in dB, seconds.
 
 --orientations draws 24 instruments instead (eight views of arm B, three targets each) and counts the answers.
 --measured takes the instrument of configs/scene-leds-measured.toml and its four lamps instead, with arm B
-displaced by three amounts; known_db has all effects that dark, flat and target do not measure. --psf also
-measures the optics' blur and veil, from a checkerboard whose dark squares are black.
+displaced by three amounts; known_db has all effects but displacement and columns, of which only splitter and
+dark level are known. --psf measures the optics' blur and veil from a fourth recording instead, of a
+checkerboard whose dark squares are black. --cases chooses the videos.
 """
 
 from __future__ import annotations
@@ -28,11 +31,12 @@ import json
 import tempfile
 import time
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
-from scipy.ndimage import gaussian_filter1d
+from scipy.ndimage import gaussian_filter, gaussian_filter1d
 
 from acquire.alignment import Alignment
 from acquire.blur import Blur
@@ -41,10 +45,12 @@ from acquire.calibrate.columns import dark, flat
 from acquire.calibrate.exposure import instrument_of, open_exposure
 from acquire.calibrate.orientation import VIEWS
 from acquire.calibrate.psf import psf
+from acquire.calibrate.sheet import Sheet
 from acquire.calibrate.target import alignment, orientation
 from acquire.calibrate.transfer import transfer
 from acquire.calibrate.veil import veil
 from acquire.config import load_rig, load_scene
+from acquire.errors import UsageError
 from acquire.forward import merge_video
 from acquire.noise import Noise
 from acquire.recon import reconstruct
@@ -56,6 +62,8 @@ from acquire.store import open_recording
 from tools.results import Run, add_option, recorded
 
 if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+
     from numpy.typing import NDArray
 
     from acquire.config.scene import SceneConfig
@@ -64,7 +72,9 @@ if TYPE_CHECKING:
 BLACK_DN = 40.0
 K = 0.1
 SEGMENT = 263
-LIGHT = {"dark": 0, "flat": 1, "target": None, "edges": None, "scene": None}
+CASES = ("raw", "calibrated", "exact", "noise", "known")
+TARGETS = ("sheet", "paper", "soft", "dots")
+LIGHT = {"dark": 0, "flat": 1, "edges": None, "scene": None, **dict.fromkeys(TARGETS)}
 SIZE, FINER = 192, 8
 NOISE = ("shot_noise", "read_noise", "dark_current")
 LIGHTS = ("beam_splitter", "stray_light")
@@ -131,9 +141,9 @@ class Drawn:
 
     def scene(self, kind: str, effects: list[dict[str, Any]], directory: Path) -> SceneConfig:
         common = {"seed": self.seed, "system_gain_dn_per_e": K, "effects": effects}
-        if kind in ("target", "edges"):
+        if kind in PICTURES:
             path = directory / f"{kind}.npy"
-            np.save(path, dots(self.seed) if kind == "target" else checkerboard(self.seed))
+            np.save(path, PICTURES[kind](self.seed))
             return VideoSceneConfig.model_validate({"kind": "video", "path": path, **common})
         leds = lamps(self.seed) if kind == "scene" else [lamp("all", "square", (0.5, 0.5, 1.0), level=0.2)]
         return LedSceneConfig.model_validate({"kind": "leds", "leds": leds, **common})
@@ -232,15 +242,45 @@ def checkerboard(seed: int) -> NDArray[np.float32]:
     return np.asarray(means, np.float32)[None]
 
 
-def calibrate(drawn: Drawn, directory: Path, lines: int, *, blur: bool = False) -> Calibration:
-    """Dark, flat, transfer, orientation, alignment, and if wanted the optics' blur and veil."""
-    taken = {kind: open_exposure(drawn.record(kind, directory, lines)) for kind in ("dark", "flat", "target")}
+def sheet(seed: int, *, dark: float = 0.0, soft: float = 0.0) -> NDArray[np.float32]:
+    """The sheet of `acquire calibrate sheet`, askew by up to 3 degrees and 20 fine pixels off."""
+    rng = np.random.default_rng(seed + 5000)
+    turn, (down, right) = float(rng.uniform(-3, 3)), rng.uniform(-20, 20, 2).tolist()
+    picture = Sheet(3).picture(SIZE, (down, right), turn)
+    picture = gaussian_filter(picture, soft, mode="nearest") if soft else picture
+    return np.asarray(dark + (1 - dark) * picture, np.float32)[None]
+
+
+PICTURES: dict[str, Callable[[int], NDArray[np.float32]]] = {
+    "sheet": sheet,
+    "paper": partial(sheet, dark=0.04),
+    "soft": partial(sheet, soft=0.5),
+    "dots": dots,
+    "edges": checkerboard,
+}
+"""What is in front of the lenses; printed black on paper reflects 3 to 5 % of the light."""
+
+
+def calibrate(
+    drawn: Drawn, directory: Path, lines: int, *, blur: bool = False, target: str = "dots"
+) -> Calibration:
+    """Dark, flat, transfer, orientation, alignment, and what else the target shows.
+
+    ``blur``: the optics' blur and veil from a checkerboard of their own.
+    """
+    taken = {kind: open_exposure(drawn.record(kind, directory, lines)) for kind in ("dark", "flat", target)}
     first = dark(taken["dark"])
     known = Calibration(first.instrument).with_step(first)
     known = known.with_step(flat(taken["flat"], known))
     known = known.with_step(transfer([taken["flat"]], known))
-    known = known.with_step(orientation(taken["target"], known))
-    known = known.with_step(alignment(taken["target"], known))
+    known = known.with_step(orientation(taken[target], known))
+    known = known.with_step(alignment(taken[target], known))
+    # as `acquire calibrate all` does, with --black if the dark parts are black
+    for step in () if blur else (psf, veil) if target in ("sheet", "soft") else (psf,):
+        try:
+            known = known.with_step(step(taken[target], known))
+        except UsageError as error:
+            print(f"    {target}: {error.message}")
     if not blur:
         return known
     edges = open_exposure(drawn.record("edges", directory, lines))
@@ -291,7 +331,9 @@ def fixed(drawn: Drawn, kind: str, kinds: tuple[str, ...], directory: Path) -> N
     )
 
 
-def pictures(drawn: Drawn, known: Calibration, directory: Path) -> dict[str, float]:
+def pictures(
+    drawn: Drawn, known: Calibration, directory: Path, wanted: Sequence[str] = CASES
+) -> dict[str, float]:
     """PSNR of the reconstructed lamps: as recorded, calibrated, in an exact model, and with noise only."""
     noise = [effect for effect in drawn.effects if effect["kind"] in NOISE]
     light = [effect for effect in drawn.effects if effect["kind"] in (*NOISE, *drawn.known)]
@@ -317,8 +359,8 @@ def pictures(drawn: Drawn, known: Calibration, directory: Path) -> dict[str, flo
     scene = build_scene(drawn.scene("scene", [], directory), 192, 1e-5)
     truth = merge_video(scene.frames(3 * 70, cuts["raw"].geometry.span), 3, 1)
     found = {}
-    for name, segment in cases.items():
-        began = time.perf_counter()
+    for name in wanted:
+        segment, began = cases[name], time.perf_counter()
         found[f"{name}_db"] = _psnr(segment, truth)
         found[f"{name}_s"] = time.perf_counter() - began
     return found
@@ -359,7 +401,7 @@ def orientations(seed: int, lines: int, run: Run) -> None:
         optics = {"b": {"turn_deg": view.turn_deg, "mirror": view.mirrored}}
         with tempfile.TemporaryDirectory() as name:
             directory = Path(name)
-            scene = drawn.scene("target", drawn.effects, directory).model_copy(
+            scene = drawn.scene("dots", drawn.effects, directory).model_copy(
                 update={
                     "optics": VideoSceneConfig.model_validate(
                         {"kind": "video", "path": "x", "optics": optics}
@@ -367,7 +409,7 @@ def orientations(seed: int, lines: int, run: Run) -> None:
                 }
             )
             path = directory / "target.zarr"
-            simulate(drawn.rig("target"), scene, path, lines)
+            simulate(drawn.rig("dots"), scene, path, lines)
             recording = open_recording(path)
             found = orientation(open_exposure(path), Calibration(instrument_of(recording)))
         right += found.orientation == view.name
@@ -389,6 +431,8 @@ def main() -> None:
     parser.add_argument("--orientations", action="store_true")
     parser.add_argument("--measured", action="store_true")
     parser.add_argument("--psf", action="store_true")
+    parser.add_argument("--target", choices=TARGETS, default="sheet")
+    parser.add_argument("--cases", nargs="+", choices=CASES, default=CASES)
     parser.add_argument("--json", type=Path)
     add_option(parser)
     options = parser.parse_args()
@@ -409,10 +453,10 @@ def instruments(options: argparse.Namespace, run: Run) -> None:
     for number, drawn in enumerate(chosen):
         with tempfile.TemporaryDirectory() as name:
             began = time.perf_counter()
-            known = calibrate(drawn, Path(name), options.lines, blur=options.psf)
+            known = calibrate(drawn, Path(name), options.lines, blur=options.psf, target=options.target)
             row = {"calibration_s": time.perf_counter() - began, **compared(drawn, known, Path(name))}
             if not options.no_video:
-                row |= pictures(drawn, known, Path(name))
+                row |= pictures(drawn, known, Path(name), options.cases)
         rows.append({"instrument": asdict(drawn), **row})
         where = f"{drawn.rows:+.2f}/{drawn.columns:+.2f} px {drawn.turn_deg:+.2f} deg {drawn.beyond}"
         where += f" psf {drawn.blur:.2f}"

@@ -1,13 +1,14 @@
 """The optics' blur: measured from slanted edges on random instruments, and its value for a reconstruction.
 
-Usage: OMP_NUM_THREADS=1 python -m tools.bench_psf [--instruments 4] [--seed 1] [--no-video]
+Usage: OMP_NUM_THREADS=1 python -m tools.bench_psf [--instruments 4] [--seed 1] [--no-video] [--target sheet]
 
 The instruments are those of `bench_calibrate`, with a random blur of 0 to 1.5 fine pixels for each arm. Dark,
 flat, target and a checkerboard turned by 3 to 20 degrees are recorded with 1024 lines each and calibrated as
-`acquire calibrate` does. Then random lamps are reconstructed from 263 lines (voxels 3 x 1): calibrated
-without the blur, with it, and from lines with only the same noise. Columns: measured minus true widths (fine
-pixels, along and across the transfer, arms A and B; arm B's includes the simulator's bilinear interpolation),
-their standard uncertainty, PSNR in dB, seconds.
+`acquire calibrate` does; with --target sheet, the target is the sheet, and shows the blur itself. Then random
+lamps are reconstructed from 263 lines (voxels 3 x 1): calibrated without the blur, with it, and from lines
+with only the same noise. Columns: measured minus true widths (fine pixels, along and across the transfer,
+arms A and B; arm B's includes the simulator's bilinear interpolation), their standard uncertainty,
+rms_in_sigma (errors of the variances in their own uncertainties: 1 if these are right), PSNR in dB, seconds.
 """
 
 from __future__ import annotations
@@ -43,7 +44,8 @@ class Blurred(Drawn):
     @property
     def widths(self) -> tuple[float, float]:
         """σ of arms A and B."""
-        a, b = np.random.default_rng(self.seed + 3000).uniform(0, 1.5, 2).tolist()
+        # 0.01 is the simulator's least
+        a, b = np.random.default_rng(self.seed + 3000).uniform(0, 1.5, 2).clip(0.01).tolist()
         return a, b
 
     @property
@@ -87,19 +89,23 @@ def psnr(segment: Segment, truth: NDArray[np.float32]) -> float:
     return float(10 * np.log10(truth[at].max() ** 2 / np.mean((result.video[at] - truth[at]) ** 2)))
 
 
-def instrument(seed: int, *, video: bool, run: Run) -> None:
+def instrument(seed: int, *, target: str, video: bool, run: Run) -> None:
     drawn = Blurred.at_random(seed)
     assert isinstance(drawn, Blurred)
     with tempfile.TemporaryDirectory() as name:
         directory = Path(name)
-        known = calibrate(drawn, directory, 1024)
-        found = psf(open_exposure(drawn.record("edges", directory, 1024)), known)
+        known = calibrate(drawn, directory, 1024, target="sheet" if target == "sheet" else "dots")
+        found = psf(open_exposure(drawn.record(target, directory, 1024)), known)
         measured, truth = found.quantities["blur_px"], true_widths(drawn)
+        # σ² has the error that is alike for narrow and wide blurs
+        names = "variance_px2", "variance_uncertainty_px2"
+        variances, doubts = (np.array(found.facts[name]) for name in names)
         row = {
             "edges_a": found.facts["a"]["edges"],
             "edges_b": found.facts["b"]["edges"],
             "largest_error_px": float(np.abs(measured.value - truth).max()),
             "errors_in_sigma": float((np.abs(measured.value - truth) / measured.uncertainty).max()),
+            "rms_in_sigma": float(np.sqrt(np.mean(np.square((variances - truth**2) / doubts)))),
         }
         if video:
             row |= pictures(drawn, known.with_step(found), directory)
@@ -115,11 +121,12 @@ def main() -> None:
     parser.add_argument("--instruments", type=int, default=4)
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--no-video", action="store_true")
+    parser.add_argument("--target", choices=("edges", "sheet"), default="edges")
     add_option(parser)
     options = parser.parse_args()
     with recorded("bench_psf", keep=options.record) as run:
         for number in range(options.instruments):
-            instrument(options.seed + number, video=not options.no_video, run=run)
+            instrument(options.seed + number, target=options.target, video=not options.no_video, run=run)
 
 
 if __name__ == "__main__":

@@ -9,7 +9,8 @@
                              └──▶ apply: a segment's offsets, responsivities, mask, alignment, optics
 
     steps       columns (dark, ambient, flat), linearity and curve, delay and delay_sweep,
-                target (orientation, align) with field, psf, veil; still: a target's image from one arm
+                target (orientation, align) with field, psf, veil; still: a target's image from one arm;
+                sheet: a drawing that serves for all four
     around them checks (does the recording suit?), guide (what to put in front of the lens), words
     afterwards  choose (which calibration), check (is it still valid?)
 

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from scipy.ndimage import gaussian_filter, map_coordinates, spline_filter
+from scipy.ndimage import gaussian_filter, gaussian_filter1d, map_coordinates, spline_filter
 from scipy.optimize import least_squares
 
 from acquire.alignment import LARGEST_DISTORTION, Alignment
@@ -38,6 +38,8 @@ DISTORTED_PIXELS, DISTORTED_SURE = 0.05, 5.0
 """Least distortion that counts, in fine pixels at the middle of a side and in standard uncertainties."""
 LEAST_FALL, FALL_SURE = 0.015, 8.0
 """Least fall of the light from the centre to a side that counts, as a part and in standard uncertainties."""
+BEND = 1.0
+"""Smoothing of second derivatives in fine pixels, below which they are mostly noise."""
 POINT_ROUNDS = 5
 """Rounds to a point's position in both images, each of which reduces its error by twice the distortion."""
 WORST_PIXELS = 0.2
@@ -263,7 +265,12 @@ class _Comparison:
         """Fit B = A·(1 + c₁·x + c₂·x²)/(1 + r₁·y + r₂·y²), with A's row y and B's column x from −1 to 1."""
         a, b, inside, (y, x) = self._pairs(numbers)
         common = self._good & inside
-        a, b, y, x = (each[common] for each in (a, b, y, x))
+        # What an edge lacks in one arm that blurs more looks like light. To first order that is a multiple of
+        # the image's second derivative, which each arm shows along its own fine axis.
+        rows_a, columns_a, rows_b, columns_b, *_ = self._points(numbers)
+        bend_a = _sampled(_bend(self._images.a, 0), rows_a, columns_a)
+        bend_b = _sampled(_bend(self._images.b, 1), rows_b, columns_b)
+        a, b, y, x, bend_a, bend_b = (each[common] for each in (a, b, y, x, bend_a, bend_b))
 
         def light(terms: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
             r1, r2, c1, c2 = terms[:4]
@@ -271,12 +278,13 @@ class _Comparison:
 
         def residual(terms: NDArray[np.float64]) -> NDArray[np.float64]:
             rows, columns = light(terms)
-            return np.asarray((b - terms[4] * a * columns / rows - terms[5]) * self._images.weight)
+            sharper = terms[6] * bend_a + terms[7] * bend_b
+            return np.asarray((b - terms[4] * a * columns / rows - terms[5] - sharper) * self._images.weight)
 
-        start = np.array([0, 0, 0, 0, numbers[4], numbers[5]])
+        start = np.array([0, 0, 0, 0, numbers[4], numbers[5], 0, 0])
         spread = float(np.median(np.abs(residual(start)))) / 0.6745
         # within the bounds both are above 0
-        most = np.array([0.4, 0.5, 0.4, 0.5, np.inf, np.inf])
+        most = np.array([0.4, 0.5, 0.4, 0.5, np.inf, np.inf, np.inf, np.inf])
         solved = least_squares(
             residual, start, bounds=(-most, most), loss="soft_l1", f_scale=max(1.0, spread), x_scale="jac"
         )
@@ -293,6 +301,20 @@ class _Comparison:
 
         The last two are from −1 to 1 over the field.
         """
+        rows_a, columns_a, rows_b, columns_b, inside, at = self._points(numbers)
+        return _sampled(self._a, rows_a, columns_a), _sampled(self._b, rows_b, columns_b), inside, at
+
+    def _points(
+        self, numbers: NDArray[np.float64]
+    ) -> tuple[
+        NDArray[Any],
+        NDArray[Any],
+        NDArray[Any],
+        NDArray[Any],
+        NDArray[np.bool_],
+        tuple[NDArray[Any], NDArray[Any]],
+    ]:
+        """Return rows and columns in A's image and in B's, and the last two values of `_pairs`."""
         # Row y of B and column x of A show one point if (y, q)·f = m·Q·(p, x) + shift, all from the middle:
         # two equations, linear in p, the row of A, and q, the column of B. Without distortion f is 1.
         alignment = _alignment(numbers, self.geometry)
@@ -313,8 +335,19 @@ class _Comparison:
         columns_a = (self._a_columns - half) / self._S
         rows_b = (self._b_rows - half) / self._S
         columns_b = at_b_column + half
-        a = map_coordinates(self._a, [rows_a, columns_a], order=3, mode="nearest", prefilter=False)
-        b = map_coordinates(self._b, [rows_b, columns_b], order=3, mode="nearest", prefilter=False)
         low, high = EDGE, self._n - 1 - EDGE
         inside = (at_a_row > low) & (at_a_row < high) & (at_b_column > low) & (at_b_column < high)
-        return a, b, inside, (p / (self._n / 2), q / (self._n / 2))
+        at = p / (self._n / 2), q / (self._n / 2)
+        return rows_a, columns_a, rows_b, columns_b, inside, at
+
+
+def _sampled(image: NDArray[Any], rows: NDArray[Any], columns: NDArray[Any]) -> NDArray[Any]:
+    """Return the values at these positions of an image that `spline_filter` has prepared."""
+    found: NDArray[Any] = map_coordinates(image, [rows, columns], order=3, mode="nearest", prefilter=False)
+    return found
+
+
+def _bend(image: NDArray[np.float64], axis: int) -> NDArray[np.float64]:
+    """Return the second derivative along the fine axis, prepared for `_sampled`."""
+    smooth = gaussian_filter1d(image, BEND, axis=axis, order=2, mode="nearest")
+    return np.asarray(spline_filter(smooth, mode="nearest"))

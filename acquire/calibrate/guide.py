@@ -20,6 +20,7 @@ class Step:
     least_lines : fewer are refused
     code : the light's code, as in `acquire.client.Client.arm`
     after : name of the step that must precede it, or empty
+    tries : further steps that its recording completes if its scene shows what they measure
     """
 
     name: str
@@ -30,6 +31,7 @@ class Step:
     finds: tuple[str, ...]
     least_lines: int = 64
     after: str = ""
+    tries: tuple[str, ...] = ()
 
 
 MOST_LINES = 2**20
@@ -74,10 +76,12 @@ FLAT = Step(
 )
 TARGET = Step(
     "target",
-    "Put a target in, at rest, with sharp, irregular texture: dots or bars of 2 to 6 fine pixels.",
+    "Put a target in, at rest and in focus, with sharp, irregular texture: dots or bars of 2 to 6 fine "
+    "pixels. The one that acquire calibrate sheet draws also has slanted squares, which show the blur.",
     lines=LINES,
     code="rig",
     finds=("orientation", "align"),
+    tries=("psf",),
 )
 PSF = Step(
     "psf",

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from scipy.linalg import LinAlgError, cho_factor, cho_solve
+from scipy.ndimage import gaussian_filter1d
 
 from acquire.errors import UsageError
 
@@ -22,6 +23,8 @@ if TYPE_CHECKING:
     from acquire.geometry import Geometry
     from acquire.lines import Segment
 
+FINE = 4.0
+"""Standard deviation, in fine pixels, of the smoothing that leaves what is no detail: a dot has at most 6."""
 SPARE = 1.25
 """Least number of lines per unknown; with fewer, noise dominates the image."""
 
@@ -54,6 +57,14 @@ class Still:
         farthest = len(self.usable)
         alike = ((image[:-far] * image[far:]).mean() < power / 2 for far in range(1, farthest))
         return next((far for far, less in enumerate(alike, 1) if less), farthest)
+
+    @property
+    def fine(self) -> float:
+        """Share of the image's variation along its rows that is finer than `FINE`, without the noise's."""
+        image = self.image[:, self.usable]
+        rough = image - gaussian_filter1d(image, FINE, axis=0)
+        power, noise = float((image - image.mean()).var()), self.uncertainty**2
+        return (float((rough**2).mean()) - noise) / (power - noise) if power > noise else 0.0
 
     def blocks(self, substeps: int) -> NDArray[np.float64]:
         """Return the image in blocks of S × S fine pixels without overlap: (M, M)."""

@@ -41,6 +41,10 @@ UNREST = 0.3
 pixels while 1024 lines are recorded has 0.4, by one 0.8; the shift is then wrong by 0.01 and by 0.05."""
 COARSE = 8
 """Width of the target's detail, in fine pixels, from which an alignment is less certain than it says."""
+ENOUGH_FINE = 0.08
+"""Share of fine detail with which it is certain all the same. The sheet has large squares among its dots, and
+a share of 0.08 to 0.14, with a blur of up to 1.3 fine pixels; dots that a blur of 4 leaves coarse have 0.04
+to 0.07."""
 SAME_BALANCE = 0.002
 """Difference of the arms' light up to which the flat's balance is kept."""
 BALANCE_ERROR = 0.001
@@ -193,7 +197,7 @@ def _unfit(known: Calibration, *stills: Still) -> list[str]:
             f"{unrest:.0%} in what a scene at rest does not explain): the alignment is less certain than it "
             "says; repeat it with the target at rest"
         )
-    if detail >= COARSE:
+    if detail >= COARSE and min(each.fine for each in stills) < ENOUGH_FINE:
         warnings.append(
             f"the target's detail is about {detail} fine pixels wide: coarse, or out of focus; the alignment "
             "is less certain than it says; focus both cameras, or use a target with detail of 2 to 6"

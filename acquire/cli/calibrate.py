@@ -10,6 +10,7 @@ import typer
 from acquire.cli.calibrate_all import calibrate_all
 from acquire.cli.calibrate_delay import delay
 from acquire.cli.calibrate_linearity import linearity
+from acquire.cli.calibrate_sheet import sheet
 from acquire.cli.completion import recordings
 from acquire.cli.output import JsonFlag, print_facts, print_json, print_table, print_warning, say
 from acquire.cli.places import calibration_place
@@ -59,6 +60,7 @@ def register(app: typer.Typer) -> None:
         psf,
         veil,
         delay,
+        sheet,
         show,
         check,
     ):
@@ -240,10 +242,11 @@ def psf(
 ) -> None:
     """Measure the width of each arm's optical blur from straight, sharp edges. This step is optional.
 
-    Place a square or a checkerboard before the lens, rotated by 3 to 20 degrees, stationary and in focus,
-    with edges at least 30 fine pixels apart, and record with the usual pseudo-random code. 1024 lines give
-    0.05 fine pixels. If the lines do not determine the blur, the command reports it. Reconstructions then
-    correct the blur.
+    Place the sheet that acquire calibrate sheet draws before the lens, or a square or a checkerboard, rotated
+    by 3 to 20 degrees, stationary and in focus, with edges at least 30 fine pixels apart, and record with the
+    usual pseudo-random code. 1024 lines give 0.05 fine pixels. The recording for align will do if it shows
+    the sheet. If the lines do not determine the blur, the command reports it.
+    Reconstructions then correct the blur.
 
     Example: [bold]acquire calibrate psf edges.zarr --out cal.zarr[/]
     """

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from acquire.calibrate.guide import AT_ONCE, LINES, MOST_LINES, NOISE_LINES, OPTIONAL, PSF, VEIL, Step
+from acquire.calibrate.guide import AT_ONCE, LINES, MOST_LINES, NOISE_LINES, OPTIONAL, PSF, TARGET, VEIL, Step
 from acquire.cli.calibrate_live import instrument, print_finding, record, save_finding, wait_for_enter
 from acquire.cli.control import SocketOption
 from acquire.cli.output import JsonFlag, note, print_json, print_warning, say
@@ -23,6 +24,18 @@ if TYPE_CHECKING:
 
 TRIES = 3
 """Attempts at a step if somebody is there to correct the cause of a failure."""
+MISSING = {
+    "psf": "the target does not show the optics' blur",
+    "veil": "the target does not show the lens's veil",
+}
+"""What a target need not show."""
+INSTEAD = {
+    "psf": "nothing corrects it, unless it was measured before; acquire calibrate sheet draws a target that "
+    "shows it, and acquire calibrate all --only psf measures it alone",
+    "veil": "nothing corrects it, unless it was measured before; acquire calibrate all --only veil measures "
+    "it alone, from more lines",
+}
+"""What to do if it does not."""
 
 
 def calibrate_all(
@@ -55,9 +68,21 @@ def calibrate_all(
             help="Do only this step: dark, flat, target, psf or veil. Repeatable. Default: the first three.",
         ),
     ] = None,
+    black: Annotated[
+        bool,
+        typer.Option(
+            "--black",
+            help="The target's dark parts send no light at all, as those of chrome on glass or film lit from "
+            "behind: also measure the lens's veil from it. Not for printed black.",
+        ),
+    ] = False,
     psf: Annotated[
         bool,
-        typer.Option("--psf", help="Also measure the optical blur at the end, from a target with edges."),
+        typer.Option(
+            "--psf",
+            help="Also measure the optical blur at the end, from a target of its own, if the first does not "
+            "show it.",
+        ),
     ] = False,
     veil: Annotated[
         bool,
@@ -72,7 +97,10 @@ def calibrate_all(
     socket: SocketOption = None,
     json: JsonFlag = False,
 ) -> None:
-    """Calibrate the instrument run by the daemon: dark, flat and target in turn, psf and veil if requested.
+    """Calibrate the instrument run by the daemon: dark, flat and target in turn.
+
+    The target shows the orientation and alignment of the arms, and also the optical blur if it has slanted
+    edges, as the sheet that acquire calibrate sheet draws. If not, the command says so, and goes on.
 
     The command gives instructions before each recording and waits for Enter. Results are saved after every
     step, so that --only can continue an interrupted calibration. Afterwards the instrument is armed or idle
@@ -84,7 +112,12 @@ def calibrate_all(
     if wrong := [each for each in only or () if each not in names]:
         raise UsageError(f"there is no step {wrong[0]!r}", possible=", ".join(names))
     # In the order of the guide, whatever the order of the options: later steps need earlier ones.
-    steps = [step for step in AT_ONCE if not only or step.name in only]
+    steps = [_with_veil(step) if black else step for step in AT_ONCE if not only or step.name in only]
+    if black and not any("veil" in step.tries for step in steps):
+        raise UsageError(
+            "--black says something of the target, which this sequence does not record",
+            possible="--black with the step target",
+        )
     wanted = ((PSF, psf), (VEIL, veil))
     optional = [step for step, asked in wanted if asked or step.name in (only or ())]
     steps += optional
@@ -114,6 +147,10 @@ def calibrate_all(
         say(f"saved in  {out}; to plot it: acquire calibrate show {out} --out DIR")
 
 
+def _with_veil(step: Step) -> Step:
+    return replace(step, tries=(*step.tries, "veil")) if step is TARGET else step
+
+
 def _step(
     daemon: Client, step: Step, out: str, directory: Path, lines: int, *, ask: bool, quiet: bool
 ) -> list[Finding]:
@@ -125,12 +162,15 @@ def _step(
         try:
             exposure = record(daemon, step.name, directory, lines, code=step.code)
             found = []
-            for evaluate in _evaluations(step, exposure, out):
+            evaluations = _evaluations(exposure)
+            for name in _wanted(step, out):
                 # Saved one by one: the next evaluation of the same recording builds on this one.
-                found.append(save_finding(out, exposure, evaluate))
+                found.append(save_finding(out, exposure, evaluations[name]))
                 if not quiet:
                     print_finding(found[-1])
                     say()
+            for name in step.tries:
+                found = _tried(name, found, out, exposure, evaluations[name], quiet=quiet)
         except UsageError as error:
             # Without anybody to correct the cause, the next attempt would fail in the same way.
             if not (ask and left):
@@ -143,16 +183,53 @@ def _step(
     raise AssertionError  # the last attempt returns or raises
 
 
-def _evaluations(step: Step, exposure: Exposure, out: str) -> Iterator[Callable[[Calibration], Finding]]:
-    """Yield the evaluations of a step's recording, each a function of the calibration so far.
+def _tried(
+    name: str,
+    found: list[Finding],
+    out: str,
+    exposure: Exposure,
+    evaluate: Callable[[Calibration], Finding],
+    *,
+    quiet: bool,
+) -> list[Finding]:
+    """Return the findings with one more if the scene shows it; otherwise the last step keeps a warning.
+
+    A target need not show everything, and what it has shown is worth keeping.
+    """
+    try:
+        more = save_finding(out, exposure, evaluate)
+    except UsageError as error:
+        text = f"{MISSING[name]}: {error.message}; {INSTEAD[name]}"
+        # kept in the calibration, so that whoever reads it later knows what is missing, and why
+        last = replace(found[-1], warnings=(*found[-1].warnings, text))
+        save_finding(out, exposure, lambda _: last)
+        print_warning(text)
+        return [*found[:-1], last]
+    if not quiet:
+        print_finding(more)
+        say()
+    return [*found, more]
+
+
+def _wanted(step: Step, out: str) -> Iterator[str]:
+    """Yield the steps that a recording must complete.
 
     The transfer is left out if a ramp was recorded (step linearity), which determines it better than one
     flat.
     """
-    from acquire.calibrate import columns, open_calibration, psf, target, veil
+    from acquire.calibrate import open_calibration
+
+    for name in step.finds:
+        if name != "transfer" or "linearity" not in open_calibration(out).steps:
+            yield name
+
+
+def _evaluations(exposure: Exposure) -> dict[str, Callable[[Calibration], Finding]]:
+    """Return the evaluation of a recording by each step, a function of the calibration so far."""
+    from acquire.calibrate import columns, psf, target, veil
     from acquire.calibrate.transfer import transfer
 
-    evaluations: dict[str, Callable[[Calibration], Finding]] = {
+    return {
         "dark": lambda _: columns.dark(exposure),
         "flat": lambda known: columns.flat(exposure, known),
         "transfer": lambda known: transfer([exposure], known),
@@ -161,6 +238,3 @@ def _evaluations(step: Step, exposure: Exposure, out: str) -> Iterator[Callable[
         "psf": lambda known: psf.psf(exposure, known),
         "veil": lambda known: veil.veil(exposure, known),
     }
-    for name in step.finds:
-        if name != "transfer" or "linearity" not in open_calibration(out).steps:
-            yield evaluations[name]

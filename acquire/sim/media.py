@@ -22,13 +22,15 @@ from pydantic import Field
 from acquire.config.base import FilePath
 from acquire.errors import DataError, UsageError
 from acquire.sim.functions import checked_light
-from acquire.sim.scene import SceneModel
+from acquire.sim.scene import MaskScene, SceneModel
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
     from pathlib import Path
 
     from numpy.typing import NDArray
+
+    from acquire.sim.scene import Scene
 
     Light = NDArray[np.floating[Any]]
 
@@ -70,11 +72,23 @@ class VideoSceneConfig(SceneModel):
     end: Literal["loop", "last"] = "loop"
     gamma: float = Field(default=1.0, gt=0, le=5, description="light = (pixel / white)^gamma")
 
-    def build(self, size: int, substep_s: float) -> VideoScene:
-        return VideoScene(self, size, substep_s)
+    def build(self, size: int, substep_s: float) -> Scene:
+        scene = VideoScene(self, size, substep_s)
+        return StillScene(scene.frames(0, 1)) if scene.is_still else scene
 
     def anchored(self, directory: Path) -> Self:
         return self.model_copy(update={"path": (directory / self.path).resolve()})
+
+
+class StillScene(MaskScene):
+    """A single picture, whose optics are simulated once instead of at every sub-step."""
+
+    def __init__(self, masks: NDArray[np.float32]) -> None:
+        self.masks = masks
+
+    def intensity(self, first: int, count: int, substep_s: float | None = None) -> NDArray[np.float64]:  # noqa: ARG002
+        """Return the intensity of the picture: (1, count)."""
+        return np.ones((1, count))
 
 
 class VideoScene:
@@ -93,6 +107,11 @@ class VideoScene:
         self._kept: OrderedDict[int, Light] = OrderedDict()
         # a file that cannot be shown is refused when the scene is made, not in a camera's process
         self.frames(0, 1)
+
+    @property
+    def is_still(self) -> bool:
+        """Whether the file has a single frame."""
+        return self._source.count == 1
 
     def frames(self, first: int, count: int) -> NDArray[np.float32]:
         """(count, row, column) float32."""

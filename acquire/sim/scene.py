@@ -6,7 +6,7 @@ code is dark there. Values do not depend on how a range of sub-steps is split in
 Sources behind masks are *separable*: ``X[t, r, c] = Σ_k intensity[k, t] · mask[k, r, c]``, which the
 streaming simulation turns into small matrix products. Scenes compose::
 
-    sources: LedScene, TargetScene, DigitScene (separable)
+    sources: LedScene, TargetScene, DigitScene, StillScene (separable)
              SpriteScene, VideoScene, FunctionScene, ArrayScene
     SumScene(parts)      adds light           ShutteredScene(scene, shutters)      blocks light
 """

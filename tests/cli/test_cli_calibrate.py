@@ -186,3 +186,23 @@ def test_what_is_no_calibration_is_not_replaced_and_refused_at_once(cli: Cli, tm
     answer = cli("calibrate", "dark", tmp_path / "no-recording.zarr", "--out", other)
     assert (answer.code, list(tmp_path.iterdir())) == (2, [other])
     assert f"{other} is not a calibration" in answer.err
+
+
+def test_the_sheet_is_drawn(cli: Cli, tmp_path: Path) -> None:
+    """For printing with its size, and as a picture of what the cameras see, for the rig's stages."""
+    paper, screen = tmp_path / "target.svg", tmp_path / "target.png"
+    answer = cli("calibrate", "sheet", "--out", paper, "--field-mm", 57.6)
+    assert answer.code == 0, answer.err
+    assert "0.3 mm" in answer.out
+    assert "The cameras see 57.6 mm × 57.6 mm of it" in paper.read_text(encoding="utf-8")
+    answer = cli("calibrate", "sheet", "--out", screen, "--json")
+    assert answer.json["fine pixels"] == 192
+    with Image.open(screen) as picture:
+        assert picture.size == (1536, 1536)
+    again = cli("calibrate", "sheet", "--out", screen)
+    assert again.code == 2
+    assert "the file exists and is not overwritten" in again.err
+    other = cli("calibrate", "sheet", "--out", tmp_path / "target.pdf")
+    assert other.code == 2
+    assert "suffix is not a known format" in other.err
+    assert "target.svg" in other.err

@@ -17,6 +17,7 @@ from live_daemon import COMMAND, Daemon
 from waiting import until
 
 from acquire.calibrate import open_calibration
+from acquire.calibrate.sheet import Sheet
 
 M, S, FINER = 64, 3, 8
 N = M * S
@@ -94,6 +95,26 @@ def test_blur_and_veil_are_measured_last_and_earlier_results_are_kept(tmp_path: 
         assert "the lens's veil" in daemon("calibrate", "show", cal).out
         with daemon.client() as client:
             assert client.status().state == "idle"
+
+
+def test_one_target_shows_everything(tmp_path: Path) -> None:
+    scene = put(tmp_path, np.full((N, N), 0.6, np.float32))
+    cal = tmp_path / "cal.zarr"
+    with contextlib.closing(Daemon(tmp_path, *SETTINGS, scene)) as daemon:
+        words = ("calibrate", "all", "--yes", "--lines", 1024, "--out", cal)
+        refused = daemon(*words, "--only", "dark", "--black")
+        assert refused.code == 2
+        assert "--black says something of the target" in refused.err
+        assert daemon(*words, "--only", "dark").code == 0
+        put(tmp_path, Sheet(S).picture(N, (-5.0, 8.0), 1.5))
+        found = daemon(*words, "--only", "target", "--black", "--json")
+        assert found.code == 0, found.err
+        assert list(found.json["steps"]) == ["orientation", "align", "psf", "veil"]
+    known = open_calibration(cal)
+    np.testing.assert_allclose(known.quantities["blur_px"].value, [[0.7, 0.7], [1.3, 1.3]], atol=0.15)
+    veil = known.quantities["veil"]
+    assert (np.abs(veil.value - 0.02) < 4 * veil.uncertainty).all()
+    assert "does not show" not in str(known.steps["align"]["warnings"])
 
 
 def test_repeatedly_missing_lines_are_reported_with_the_ends_of_the_recordings(tmp_path: Path) -> None:

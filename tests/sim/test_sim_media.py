@@ -12,7 +12,7 @@ from PIL import Image
 from acquire.config import load_scene
 from acquire.config.scene import SceneFile
 from acquire.errors import DataError, UsageError
-from acquire.sim.media import _KEPT_FRAMES, VideoScene, VideoSceneConfig, resample
+from acquire.sim.media import _KEPT_FRAMES, StillScene, VideoScene, VideoSceneConfig, resample
 from acquire.sim.scenes import build_scene
 from acquire.sim.sprites import SpriteConfig, SpritesSceneConfig
 
@@ -257,3 +257,16 @@ def test_a_frame_that_cannot_be_read_is_named(tmp_path, monkeypatch):
     (tmp_path / "v.gif").write_bytes((tmp_path / "v.gif").read_bytes()[:40])
     with pytest.raises(DataError, match=r"v\.gif: frame 2 cannot be read"):
         scene.frames(2, 1)
+
+
+def test_a_still_picture_s_optics_are_simulated_once(tmp_path):
+    """Before a camera at full rate they were simulated at every sub-step, and the camera stalled."""
+    np.save(tmp_path / "still.npy", np.random.default_rng(1).random((1, 48, 48)).astype(np.float32))
+    config = VideoSceneConfig(kind="video", path=tmp_path / "still.npy")
+    scene = config.build(24, 1e-5)
+    assert isinstance(scene, StillScene)
+    frames = VideoScene(config, 24, 1e-5).frames(-5, 40)
+    np.testing.assert_array_equal(scene.frames(-5, 40), frames)
+    np.save(tmp_path / "moving.npy", np.zeros((2, 8, 8), np.float32))
+    moving = VideoSceneConfig(kind="video", path=tmp_path / "moving.npy", frame_rate_hz=10.0)
+    assert isinstance(moving.build(8, 1e-5), VideoScene)
