@@ -160,10 +160,10 @@ def test_without_a_compiler_the_rig_says_what_to_install(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     monkeypatch.setenv("PATH", str(tmp_path))
-    with pytest.raises(UsageError, match=r"which needs g\+\+ \(Debian, Ubuntu: apt install g\+\+\)"):
+    with pytest.raises(UsageError, match=r"this host lacks g\+\+ \(Debian, Ubuntu: apt install g\+\+\)"):
         RtlTransport(CLOCK_HZ)
     monkeypatch.setattr(acquire.sim.rtl, "ROOT", tmp_path)
-    with pytest.raises(UsageError, match="which are in a checkout") as caught:
+    with pytest.raises(UsageError, match="they are in a checkout") as caught:
         RtlTransport(CLOCK_HZ)
     assert "'simulated'" in caught.value.possible
     assert f"tdi-acquire=={__version__}" in caught.value.hint  # an installed package states how to get them
