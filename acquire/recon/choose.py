@@ -81,8 +81,10 @@ ITERATIONS_PER_TRIAL = 10
 OUTDONE = 0.6
 """Largest error of the cosines at a glance, relative to the other candidates, for which they are continued
 before the others are searched, and of a rival of what follows, for which that goes no further. The glance of
-lamps has 0.25 to 0.55. The same of a smooth volume, relative to a first volume, for which it is evident that
-something flows: flames and waves have 0.3 to 0.9."""
+lamps has 0.25 to 0.55."""
+EVIDENT = 0.55
+"""Largest error of a smooth volume, relative to a first volume and to one of changing brightness, for which
+it is evident that something flows: flames and waves have 0.3 to 0.9, light that flickers 0.63 and more."""
 FAR = 1.25
 """Largest error of a smooth volume or a still, relative to the volume's, for which it is searched further."""
 SMOOTHER = 0.85
@@ -191,9 +193,7 @@ def _try_motion(bench: Workbench, tried: _Tried, cosines: InBand, at_a_glance: f
     to 7, and what moves or turns by a path or a cycle.
     """
     tried.smooth = bench.probe(bench.fitting(SMOOTH), min(at_a_glance, tried.best.error))
-    if tried.flows:
-        return None
-    followed = _following(tried.volume, min(at_a_glance, tried.smooth.error))
+    followed = None if tried.flows else _following(tried.volume, min(at_a_glance, tried.smooth.error))
     # What moves as one does not flicker.
     if followed is None:
         # The first cosine is constant, so that this is the video's mean over time.
@@ -228,10 +228,10 @@ class _Tried:
 
     @property
     def flows(self) -> bool:
-        """Whether a smooth volume outdoes one at rest so far that no other motion need be tried."""
+        """Whether a smooth volume outdoes others so far that no other motion need be tried."""
         if self.smooth is None or not self.much_moves(self.volume):
             return False
-        return self.smooth.error < OUTDONE * self.volume.error
+        return self.smooth.error < EVIDENT * self.best_of(self.volume, self.bright).error
 
     def much_moves(self, volume: Trial) -> bool:
         """Whether a still is far from a volume: else a flash before a still may be all that changes."""
@@ -239,8 +239,13 @@ class _Tried:
 
     @property
     def best(self) -> Trial:
-        trials = (self.volume, self.plain, self.smooth, self.bright, self.followed, self.cycle)
-        return min((trial for trial in trials if trial is not None), key=_error)
+        others = self.plain, self.smooth, self.bright, self.followed, self.cycle
+        return self.best_of(self.volume, *others)
+
+    @staticmethod
+    def best_of(first: Trial, *others: Trial | None) -> Trial:
+        """The best of these, of which some may not have been tried."""
+        return min((first, *(trial for trial in others if trial is not None)), key=_error)
 
 
 def _wins(bench: Workbench, refined: Estimate, best: Trial) -> bool:
@@ -263,7 +268,8 @@ def _search(bench: Workbench, tried: _Tried, trials: int, rival: float) -> Trial
     """
     smooth = tried.smooth or bench.attempt(bench.fitting(SMOOTH), FIRST_ITERATIONS)
     volume = tried.volume if tried.flows else _best_volume(bench, tried, min(rival, smooth.error))
-    if tried.much_moves(volume) and smooth.error < min(FLOWS * volume.error, FAR * rival):
+    least = FLOWS * tried.best_of(volume, tried.bright).error
+    if tried.much_moves(volume) and smooth.error < min(least, FAR * rival):
         return learn_spectrum(smooth)
     plain = still = tried.plain
     bright = tried.bright

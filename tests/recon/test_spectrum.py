@@ -51,8 +51,8 @@ def test_what_flows_is_better_with_its_own_spectrum(scene: str, monkeypatch: pyt
     assert quality_db(learned, scene) > quality_db(without, scene) + 1.0
 
 
-@pytest.mark.parametrize("scene", ["runner", "splash"])
-def test_what_has_edges_does_not_flow(scene: str) -> None:
+@pytest.mark.parametrize("scene", ["runner", "splash", "flicker"])
+def test_what_moves_or_flickers_does_not_flow(scene: str) -> None:
     """A quadratic prior admits noise that hardly shows in the lines, with any spectrum."""
     parameters = found(scene).parameters
     assert not parameters.get("learned")
