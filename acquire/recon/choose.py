@@ -84,7 +84,10 @@ before the others are searched, and of a rival of what follows, for which that g
 lamps has 0.25 to 0.55."""
 EVIDENT = 0.55
 """Largest error of a smooth volume, relative to a first volume and to one of changing brightness, for which
-it is evident that something flows: flames and waves have 0.3 to 0.9, light that flickers 0.63 and more."""
+it is evident that something flows."""
+FAR_FROM_REST = 0.33
+"""Largest error of a smooth volume, relative to a still's, for which something flows: flames and waves have
+0.11 to 0.31, and a flash before a still, light that flickers, bodies and wheels 0.35 and more."""
 FAR = 1.25
 """Largest error of a smooth volume or a still, relative to the volume's, for which it is searched further."""
 SMOOTHER = 0.85
@@ -92,8 +95,8 @@ SMOOTHER = 0.85
 admits more noise that does not show."""
 FLOWS = 0.9
 """Largest error of a smooth volume, relative to the best of the others, all after their first trials, for
-which these are not searched further: flames and waves have 0.35 to 0.86, a few flames 1.04, and all else 1.03
-and more, but for a flash before a still."""
+which these are not searched further: flames and waves have 0.35 to 0.86, and a few flames 1.04. Of what is
+no `FAR_FROM_REST`, some have 0.6 to 0.9, too."""
 MOVING = 0.97
 """Largest error of a volume, relative to a still's, for which it is preferred; the change from a still equals
 the still where its prior is strong, and need only be better."""
@@ -229,13 +232,10 @@ class _Tried:
     @property
     def flows(self) -> bool:
         """Whether a smooth volume outdoes others so far that no other motion need be tried."""
-        if self.smooth is None or not self.much_moves(self.volume):
+        if self.smooth is None:
             return False
-        return self.smooth.error < EVIDENT * self.best_of(self.volume, self.bright).error
-
-    def much_moves(self, volume: Trial) -> bool:
-        """Whether a still is far from a volume: else a flash before a still may be all that changes."""
-        return self.plain.error >= FAR * volume.error
+        least = EVIDENT * self.best_of(self.volume, self.bright).error
+        return self.smooth.error < min(least, FAR_FROM_REST * self.plain.error)
 
     @property
     def best(self) -> Trial:
@@ -269,7 +269,7 @@ def _search(bench: Workbench, tried: _Tried, trials: int, rival: float) -> Trial
     smooth = tried.smooth or bench.attempt(bench.fitting(SMOOTH), FIRST_ITERATIONS)
     volume = tried.volume if tried.flows else _best_volume(bench, tried, min(rival, smooth.error))
     least = FLOWS * tried.best_of(volume, tried.bright).error
-    if tried.much_moves(volume) and smooth.error < min(least, FAR * rival):
+    if smooth.error < min(least, FAR_FROM_REST * tried.plain.error, FAR * rival):
         return learn_spectrum(smooth)
     plain = still = tried.plain
     bright = tried.bright
@@ -278,7 +278,7 @@ def _search(bench: Workbench, tried: _Tried, trials: int, rival: float) -> Trial
     if bright is not None and flickers and bright.error < BRIGHTER * volume.error:
         volume = bright
     # Where much moves, a still is not searched further, and is no ground for a change.
-    if not tried.much_moves(volume):
+    if plain.error < FAR * volume.error:
         still, volume = _with_change(bench, plain, volume, trials)
     if volume.error < FAR * rival:
         volume = volume.bench.climb(volume, trials)
