@@ -1,10 +1,11 @@
 """The brightness of a whole scene over time: g in X(r, c, t) = g(t)·V(r, c, t), from all lines at once.
 
 With V known, a line is linear in g: Y(i, ·) = Σ_t g(t)·E(t)·V's light along the line's staircase (Eq. 1).
-There are a few hundred unknowns for all samples; if V contains part of the brightness already, g stays near
-1. The lines carry no information about sub-steps without light: with more cosines than g needs, least squares
-would let it run wild between two flashes. Each cosine of g − 1 therefore has an energy γ that it shares with
-its neighbours; γ and the noise σ² are those for which the lines are most likely (`evidence`).
+There are a few hundred unknowns for all samples. The lines carry no information about sub-steps without
+light: with more cosines than g needs, least squares would let it run wild between two flashes. Each cosine of
+g − 1 therefore has an energy γ that it shares with its neighbours; γ and the noise σ² are those for which the
+lines are most likely (`evidence`). All of g is fitted, and not its change since the last fit, to whose errors
+V has adapted, so that nothing would seem to need a change.
 """
 
 from __future__ import annotations
@@ -31,6 +32,9 @@ MOST_STEPS = 12
 """Upper limit on the fixed-point steps of the prior."""
 NEIGHBOURS = 9
 """Number of neighbouring cosines that share their energy: the light of one lamp is rarely in a single one."""
+INDEPENDENT = 0.1
+"""Share of the samples that count: most of their misfit is the video's own error, which neighbouring samples
+have in common."""
 DIMMEST = 0.02
 """Smallest brightness relative to the mean; dimmer instants would not be seen at all."""
 
@@ -75,10 +79,12 @@ def fit_brightness(
             energy, samples = energy + float(lines @ lines), samples + len(lines)
     if not normal.any():
         return np.ones(frames)  # a dark video explains nothing, however bright
+    normal, right, energy = normal * INDEPENDENT, right * INDEPENDENT, energy * INDEPENDENT
+    counted = round(samples * INDEPENDENT)
     # The prior draws to g = 1, so that g − 1 is solved for.
     flat = basis @ np.ones(frames)
-    left = NormalEquations(normal, right, energy, samples).left(flat)
-    change = _most_likely(NormalEquations(normal, right - normal @ flat, left, samples))
+    left = NormalEquations(normal, right, energy, counted).left(flat)
+    change = _most_likely(NormalEquations(normal, right - normal @ flat, left, counted))
     brightness = np.maximum(basis.T @ (flat + change), DIMMEST)
     return np.asarray(brightness / brightness.mean())
 

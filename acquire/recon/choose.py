@@ -196,13 +196,30 @@ def _try_motion(bench: Workbench, tried: _Tried, cosines: InBand, at_a_glance: f
     to 7, and what moves or turns by a path or a cycle.
     """
     tried.smooth = bench.probe(bench.fitting(SMOOTH), min(at_a_glance, tried.best.error))
-    followed = None if tried.flows else _following(tried.volume, min(at_a_glance, tried.smooth.error))
-    # What moves as one does not flicker.
-    if followed is None:
-        # The first cosine is constant, so that this is the video's mean over time.
-        picture = (cosines.basis.matrix()[0, 0] * host(cosines.solver.theta[0, ...])).clip(0)
-        tried.bright = bench.brighten(picture, cosines.basis.cosines, min(at_a_glance, tried.best.error))
+    rival = min(at_a_glance, tried.smooth.error)
+    followed = None if tried.flows else _following(tried.volume, rival)
+    if followed is not None and followed.error < rival:
+        return _in_its_light(followed, cosines.basis.cosines)
+    # What flickers may seem to move. The first cosine is constant, so that this is the mean over time.
+    picture = (cosines.basis.matrix()[0, 0] * host(cosines.solver.theta[0, ...])).clip(0)
+    still = np.broadcast_to(picture, (bench.frames, *picture.shape))
+    tried.bright = bright = bench.brighten(still, cosines.basis.cosines, min(rival, tried.best.error))
+    if bright is not None and bright is tried.best:
+        tried.bright = _moving_in(bright)
     return followed
+
+
+def _in_its_light(followed: Trial, cosines: int) -> Trial:
+    """What moves as one, or the same times a changing brightness in so many cosines, if that predicts better.
+
+    The brightness is first fitted to what does not change on the way, as the mean over time is at rest.
+    """
+    bench, coefficients = followed.bench, host(followed.coefficients)
+    constant = np.zeros_like(coefficients)
+    constant[0] = coefficients[0]
+    video = host(followed.basis.synthesize(bench.problem.arrays.asarray(constant)))
+    lit = bench.brighten(np.maximum(video, 0), cosines, followed.error, followed.candidate)
+    return lit if lit is not None and lit.error < BRIGHTER * followed.error else followed
 
 
 def _cycle(bench: Workbench, cosines: InBand, rises: tuple[float, ...], rival: float) -> Trial | None:
@@ -238,6 +255,13 @@ class _Tried:
         return self.smooth.error < min(least, FAR_FROM_REST * self.plain.error)
 
     @property
+    def flickers(self) -> bool:
+        """Whether a changing brightness outdoes others so far that no other motion need be tried."""
+        if self.bright is None:
+            return False
+        return self.bright.error < OUTDONE * self.best_of(self.volume, self.followed, self.cycle).error
+
+    @property
     def best(self) -> Trial:
         others = self.plain, self.smooth, self.bright, self.followed, self.cycle
         return self.best_of(self.volume, *others)
@@ -267,15 +291,16 @@ def _search(bench: Workbench, tried: _Tried, trials: int, rival: float) -> Trial
     Of candidates that are far from the error of a ``rival``, only the first trials are made.
     """
     smooth = tried.smooth or bench.attempt(bench.fitting(SMOOTH), FIRST_ITERATIONS)
-    volume = tried.volume if tried.flows else _best_volume(bench, tried, min(rival, smooth.error))
+    settled = tried.flows or tried.flickers
+    volume = tried.volume if settled else _best_volume(bench, tried, min(rival, smooth.error))
     least = FLOWS * tried.best_of(volume, tried.bright).error
     if smooth.error < min(least, FAR_FROM_REST * tried.plain.error, FAR * rival):
         return learn_spectrum(smooth)
     plain = still = tried.plain
     bright = tried.bright
     # To a brightness, a flash in front of a still is the flash of everything.
-    flickers = bright is not None and bench.held_out.clearly_less(bright.errors, plain.errors)
-    if bright is not None and flickers and bright.error < BRIGHTER * volume.error:
+    changes = bright is not None and bench.held_out.clearly_less(bright.errors, plain.errors)
+    if bright is not None and changes and bright.error < BRIGHTER * volume.error:
         volume = bright
     # Where much moves, a still is not searched further, and is no ground for a change.
     if plain.error < FAR * volume.error:
@@ -284,7 +309,7 @@ def _search(bench: Workbench, tried: _Tried, trials: int, rival: float) -> Trial
         volume = volume.bench.climb(volume, trials)
         if volume.candidate.brightness:
             volume = volume.bench.follow_brightness(volume)
-        if volume.candidate.drift or volume.candidate.rotation:
+        elif volume.candidate.drift or volume.candidate.rotation:
             volume = volume.bench.follow_path(volume)
         if volume.candidate.period_frames:
             volume = volume.bench.follow_speed(volume)
@@ -342,6 +367,22 @@ def _following(volume: Trial, rival: float) -> Trial | None:
                 outdone = rival < OUTDONE * best.error
                 volume = found = best if outdone else _along(best, max(sides))
     return found
+
+
+def _moving_in(bright: Trial) -> Trial:
+    """A volume of changing brightness, or one that also follows what moves as one, if it predicts better."""
+    bench, best = bright.bench, bright
+    for path in (drifting, turning):
+        candidate = path(bright)
+        if candidate is None or bench.clock.spent(SEARCH_SHARE):
+            continue
+        bench.use_brightness(bright.brightness)
+        grounds = (replace(candidate, ground=ground) for ground in (0.0, GROUND))
+        found = min((bench.probe(each, bright.error) for each in grounds), key=_error)
+        if found.error < HOPELESS * bright.error:
+            best = min(best, bench.alternate(found), key=_error)
+    bench.use_brightness(best.brightness)
+    return best
 
 
 def _or_turning(cycle: Trial, rival: float) -> Trial:

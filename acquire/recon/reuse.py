@@ -147,7 +147,7 @@ def reuse_choice(bench: Workbench, trials: int) -> Estimate | None:
         return None
     bright = None
     if choice.brightness:
-        bright = bench.brighten(bench.video(still)[0].clip(0), choice.brightness, still.error)
+        bright = bench.brighten(bench.video(still).clip(0), choice.brightness, still.error)
         if bright is None or not bright.error < still.error:
             return None
     moving = _moving(bench, choice, bright)
@@ -157,8 +157,12 @@ def reuse_choice(bench: Workbench, trials: int) -> Estimate | None:
 
 def _moving(bench: Workbench, choice: Choice, start: Trial | None) -> Trial:
     """A video with the choice handed over, whose path, speed or spectrum is fitted to the lines."""
-    moving = bench.attempt(choice.candidate(bench.frames), FIRST_ITERATIONS, start)
-    if choice.drift or choice.rotation:
+    on_path = choice.drift or choice.rotation
+    # A step from a video at rest to one on a path hardly arrives there.
+    moving = bench.attempt(choice.candidate(bench.frames), FIRST_ITERATIONS, None if on_path else start)
+    if choice.brightness:
+        moving = bench.alternate(moving)
+    elif on_path:
         moving = bench.follow_path(moving)
     if choice.period_frames:
         # What was handed over had more iterations.

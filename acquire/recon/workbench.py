@@ -44,21 +44,22 @@ SEARCH_SHARE = 0.6
 """Upper limit on the search's share of the budget."""
 GAIN_OF_WEAKER = 0.02
 """Relative gain of the prediction that a weaker prior needs to be preferred; a stronger one needs none."""
-BRIGHT_ROUNDS = 8
-"""Largest number of fits of the whole scene's brightness, in turn with a volume."""
+BRIGHT_ROUNDS, BRIGHT_ITERATIONS = 3, 8
+"""Number of fits of the whole scene's brightness that are judged together, each in turn with so many
+iterations of a volume: with more, the volume adapts to a wrong brightness, which then looks nearly right."""
 WIDER = 0.9
 """Largest error of a brightness of twice as many cosines, relative to that before, for which it is preferred:
 it also follows the errors of the volume. One that gained 4 % was wrong by 12 %, where it had been by 6 %."""
 PURSUED = 0.95
-"""Largest error of such a round, relative to the one before, for which it is pursued while others predict
-better."""
+"""Largest error after such rounds, relative to that before, for which they go on while others predict better.
+"""
 BRIGHTER = 0.9
 """Largest error of a volume of changing brightness, relative to that of a constant one, for which it is
 preferred."""
-SPEED_ROUNDS, MOST_CHANGES, LONG_STRIDE = 12, 3, 4.0
-"""Largest number of fits of a speed, in turn with what moves; number of changes of a cycle's; and how much
-farther than the fit says the speed is moved at first: a cycle adapts to a wrong one, which then looks nearly
-right."""
+MOST_ROUNDS, MOST_CHANGES, LONG_STRIDE = 12, 3, 4.0
+"""Largest number of fits of a speed or path, in turn with what moves; number of changes of a cycle's; and how
+much farther than the fit says the speed is moved at first: a cycle adapts to a wrong one, which then looks
+nearly right."""
 WORTH_A_ROUND, MUCH_A_ROUND = 0.99, 0.9
 """Largest error, relative to that before, with which the same kind of fit goes on: near a rival's, and far
 from it. A wrong change of speed loses 10 to 50 % in a round, and what does not repeat nothing."""
@@ -68,9 +69,10 @@ NEARLY_REPEATS, NO_CYCLE = 1.3, 4.0
 begin at up to 2.8 and end at 0.7, and a fan whose speed changes begins at 2.4 and ends at 0.8."""
 PARTS = (3, 2)
 """Parts of a period that are tried, each as long as it helps."""
-PROBE, HOPELESS = 10, 2.5
+PROBE, HOPELESS, TOO_BRIGHT = 10, 2.5, 4.0
 """Number of iterations after which a trial ends whose error is this many times that of a rival: the cosines'
-lead is 4 and more for lamps, and 1.3 to 2 for a flame or a scene that flickers as a whole."""
+lead is 4 and more for lamps, and 1.3 to 2 for a flame or a scene that flickers as a whole. With the first
+brightness, which is fitted to a picture, the latter have up to 2.6 times a rival's."""
 STEADY_BRIGHTNESS = 0.03
 """Standard deviation of a brightness that is left to the other priors."""
 
@@ -161,44 +163,59 @@ class Workbench:
             return theta
         return self.problem.arrays.asarray(merge_video(host(theta), self.merge, 1))
 
-    def brighten(self, picture: NDArray[Any], cosines: int, rival: float) -> Trial | None:
-        """Fit the brightness of the whole scene and a calm volume in turn; None if the brightness is steady.
+    def brighten(
+        self, video: NDArray[Any], cosines: int, rival: float, candidate: Candidate | None = None
+    ) -> Trial | None:
+        """Fit the brightness of the whole scene and a volume in turn; None if the brightness is steady.
 
-        The first fit is to ``picture`` (n′, n′), which moves nothing: the time mean of another video.
+        The first fit is to a ``video`` (frames, n′, n′) without changes of brightness, such as the time mean
+        of another. The volume is a calm one if no ``candidate`` is given.
         """
         if self.clock.spent(SEARCH_SHARE):
             return None
         self._bright_cosines = min(cosines, self.frames)
-        self._fit_brightness(
-            np.broadcast_to(picture, (self.frames, *picture.shape)), None, self._bright_cosines
-        )
+        self._fit_brightness(video, self._bright_cosines)
         if self._brightness is None or self._brightness.std() < STEADY_BRIGHTNESS:  # its mean is 1
             return None
-        best = self.probe(replace(self.fitting(CALM), brightness=True), rival)
-        return self.follow_brightness(best, rival) if best.error < HOPELESS * rival else best
+        candidate = replace(candidate or self.fitting(CALM), brightness=True)
+        best = self.probe(candidate, rival, TOO_BRIGHT)
+        return self.alternate(best, rival) if best.error < TOO_BRIGHT * rival else best
 
-    def follow_brightness(self, best: Trial, rival: float = np.inf) -> Trial:
-        """Fit the brightness and a volume in turn as long as this improves the prediction.
+    def follow_brightness(self, best: Trial) -> Trial:
+        """Fit the brightness and a volume in turn, and then one of twice as many cosines, if that pays.
 
-        When it no longer does, the brightness gets twice as many cosines: the error has to fall to `WIDER`
-        times its value. As long as the ``rival`` predicts better, every round has to improve it clearly.
+        The error has to fall to `WIDER` times its value.
         """
-        cosines = self._bright_cosines
-        for _ in range(BRIGHT_ROUNDS):
-            if self.clock.spent(SEARCH_SHARE):
+        best = self.alternate(best)
+        while self._bright_cosines < self.frames:
+            cosines, self._bright_cosines = self._bright_cosines, min(self.frames, 2 * self._bright_cosines)
+            wider = self.alternate(best)
+            if wider.error >= WIDER * best.error:
+                self._bright_cosines = cosines
                 break
-            self._fit_brightness(np.maximum(self.video(best), 0), best.brightness, cosines)
-            found = self.attempt(best.candidate, NEXT_ITERATIONS, best)
-            widened = cosines > self._bright_cosines
-            usual = 1 - GAIN_OF_WEAKER if found.error < rival else PURSUED
-            improved = found.error < (WIDER if widened else usual) * best.error
-            if improved or (not widened and found.error < best.error):
-                best, self._bright_cosines = found, cosines
-            if not improved:
-                if widened or best.error >= rival or cosines == self.frames:
+            best = wider
+        self.use_brightness(best.brightness)
+        return best
+
+    def alternate(self, best: Trial, rival: float = 0) -> Trial:
+        """Fit the brightness, a volume and its path, if it follows one, in turn as long as this pays.
+
+        With a ``rival``, they end where they predict better, and have to improve clearly until then.
+        """
+        latest = best
+        for _ in range(MOST_ROUNDS):
+            before = best.error
+            candidate = _path_again(latest) or latest.candidate
+            for _ in range(BRIGHT_ROUNDS):
+                if self.clock.spent(SEARCH_SHARE):
                     break
-                cosines = min(self.frames, 2 * cosines)
-        self._use_brightness(best.brightness)
+                unlit = host(latest.basis.synthesize(latest.coefficients))
+                self._fit_brightness(np.maximum(unlit, 0), self._bright_cosines)
+                latest = self.attempt(candidate, BRIGHT_ITERATIONS, latest)
+                best = min(best, latest, key=_error)
+            if best.error < rival or best.error >= (PURSUED if rival else WORTH_A_ROUND) * before:
+                break
+        self.use_brightness(best.brightness)
         return best
 
     def repeat(self, period_frames: float, speed_changes: tuple[float, ...], rival: float) -> Trial:
@@ -235,7 +252,7 @@ class Workbench:
         While its error is larger than ``near``, it has to improve much in every round.
         """
         stride, order = LONG_STRIDE, len(best.candidate.speed_changes)
-        for _ in range(SPEED_ROUNDS):
+        for _ in range(MOST_ROUNDS):
             basis, far = best.basis, best.error > near
             # The comb's period is not wrong by as much as that.
             order = max(order, 1) if far else order
@@ -261,24 +278,22 @@ class Workbench:
 
     def follow_path(self, best: Trial) -> Trial:
         """Find the velocity or the turn again in the better video, as long as the prediction improves."""
-        for _ in range(SPEED_ROUNDS):
-            moved = turning(best) if best.candidate.rotation else drifting(best)
+        for _ in range(MOST_ROUNDS):
+            moved = _path_again(best)
             if moved is None or self.clock.spent(SEARCH_SHARE):
                 break
             found = self.attempt(moved, NEXT_ITERATIONS, best)
             gained = found.error < WORTH_A_ROUND * best.error
-            best = min(best, found, key=lambda trial: trial.error)
+            best = min(best, found, key=_error)
             if not gained:
                 break
         return best
 
-    def _fit_brightness(self, video: NDArray[Any], brightness: NDArray[Any] | None, cosines: int) -> None:
-        """Use the brightness that a video, which has a ``brightness`` already, needs in the next trials."""
-        found = fit_brightness(self.given.segment, self.problem, video, self._merges, cosines)
-        found = found if brightness is None else found * brightness
-        self._use_brightness(found / found.mean())
+    def _fit_brightness(self, video: NDArray[Any], cosines: int) -> None:
+        """In the next trials, use the brightness with which a video of a constant one explains the lines."""
+        self.use_brightness(fit_brightness(self.given.segment, self.problem, video, self._merges, cosines))
 
-    def _use_brightness(self, brightness: NDArray[Any] | None) -> None:
+    def use_brightness(self, brightness: NDArray[Any] | None) -> None:
         self._brightness = brightness
         # Operators that contain the former brightness are out of date.
         self._operators = {key: kept for key, kept in self._operators.items() if not key[1]}
@@ -453,3 +468,14 @@ class Workbench:
         if brightness is not None:
             code = code * np.repeat(brightness, self._merges[1])[: len(code)]
         return segment_operator(segment, basis, *self._merges, code=code)
+
+
+def _path_again(trial: Trial) -> Candidate | None:
+    """The candidate on the path that its video shows now; None if it follows none, or the path is found."""
+    if trial.candidate.rotation:
+        return turning(trial)
+    return drifting(trial) if trial.candidate.drift else None
+
+
+def _error(trial: Trial) -> float:
+    return trial.error
