@@ -97,10 +97,12 @@ class LitPixels:
         self.other_lines, self.other_video = unknowns.other_lines, unknowns.other_video
 
     def unstacked(self, theta: Array, found: Patterns) -> Patterns:
+        """Return the patterns with 0 in the pixels that are dark."""
         every = self.free.unstacked(theta, found)
         return replace(every, patterns=every.patterns * self._lit)
 
     def operator(self, patterns: Operator, found: Patterns, /) -> Operator:
+        """Return the operator of the lit pixels alone."""
         return self.free.operator(_InLitPixels(patterns, self._lit), found)
 
 
