@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from live_daemon import Daemon, acquire
 from packed import install
+from waiting import until
 
 from acquire.errors import UsageError
 from acquire.store import open_recording, verify
@@ -62,3 +63,55 @@ def test_lines_of_a_driver_that_was_installed_are_recorded(
     used = [("camera driver", "ramp"), ("trigger driver", "slow-link"), ("codec", "differences")]
     assert recording.attrs["plugins"] == [{"kind": kind, "name": name, **extras} for kind, name in used]
     assert "camera driver ramp of lab-extras 0.3" in acquire("info", tmp_path / "ramp.zarr").out
+
+
+BRITTLE = """
+import zlib
+from pathlib import Path
+from typing import ClassVar
+from acquire.store.variant import CodecVariant
+
+class Brittle(CodecVariant):
+    '''zlib, until a file appears.'''
+
+    zarr_name: ClassVar[str] = "lab.brittle"
+    file: str
+
+    def encode(self, data):
+        if Path(self.file).exists():
+            raise RuntimeError("out of cheese")
+        return zlib.compress(data, 1)
+
+    def decode(self, data, size):
+        return zlib.decompress(data)
+"""
+
+
+def test_a_codec_that_fails_ends_the_recording_with_what_is_on_disk(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    about = tmp_path / "site" / "lab_brittle-1.dist-info"
+    about.mkdir(parents=True)
+    (about / "METADATA").write_text("Metadata-Version: 2.1\nName: lab-brittle\nVersion: 1\n")
+    (about / "entry_points.txt").write_text("[acquire.codecs]\nbrittle = lab_brittle:Brittle\n")
+    (tmp_path / "site" / "lab_brittle.py").write_text(BRITTLE)
+    searched = (str(tmp_path / "site"), os.environ.get("PYTHONPATH"))
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join(filter(None, searched)))
+    codec = ("recording.codec='brittle'", f"recording.codec_options={{file = '{tmp_path / 'fails'}'}}")
+    daemon = Daemon(tmp_path, *codec, "recording.commit_s=0.2")
+    try:
+        assert daemon("arm").code == 0, daemon.log.read_text()
+        assert daemon("start", "run.zarr").code == 0
+        until(lambda: daemon("status", "--json").json["recording"]["committed_lines"] > 100)
+        (tmp_path / "fails").touch()
+        assert daemon("status", "--wait", "faulted").code == 0
+        status = daemon("status", "--json").json
+    finally:
+        daemon.close()
+    why = "codec failed while committing: codec 'brittle' of lab-brittle failed: RuntimeError: out of cheese"
+    assert why in status["fault"]
+    assert all(arm["ledger"]["balanced"] for arm in status["arms"].values())
+    recording = open_recording(tmp_path / "run.zarr")
+    assert (recording.state, recording.attrs["run_condition"]) == ("sealed", "ABORTED")
+    assert recording.lines > 100
+    assert verify(tmp_path / "run.zarr").intact
