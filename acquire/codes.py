@@ -103,6 +103,7 @@ class PrbsCode:
         return cls(degree, mix_seed(seed, degree), seed)
 
     def bits(self, start: int, length: int) -> NDArray[np.uint8]:
+        """Return ``length`` bits from sub-step ``start`` on, as uint8; 0 before sub-step 0."""
         import numpy as np
 
         _check_range(start, length)
@@ -111,6 +112,7 @@ class PrbsCode:
         return np.concatenate([np.zeros(dark, np.uint8), lit])
 
     def to_attrs(self) -> dict[str, Any]:
+        """Return the code as the attribute ``code`` of recordings; the seed only if it is known."""
         # Hexadecimal text: states of degree 64 exceed what JSON readers in other languages keep exactly.
         return {
             "kind": self.kind,
@@ -134,6 +136,7 @@ class ConstantCode:
             raise UsageError(f"a constant code cannot be {self.value!r}", possible="0 or 1")
 
     def bits(self, start: int, length: int) -> NDArray[np.uint8]:
+        """Return ``length`` equal bits from sub-step ``start`` on, as uint8; 0 before sub-step 0."""
         import numpy as np
 
         _check_range(start, length)
@@ -141,6 +144,7 @@ class ConstantCode:
         return np.where(index < 0, 0, self.value).astype(np.uint8)
 
     def to_attrs(self) -> dict[str, Any]:
+        """Return the code as the attribute ``code`` of recordings."""
         return {"kind": self.kind, "value": self.value, "start": 0}
 
 
@@ -179,6 +183,7 @@ class ListedCode:
         return cls(np.packbits(given).tobytes().hex(), len(given), repeats)
 
     def bits(self, start: int, length: int) -> NDArray[np.uint8]:
+        """Return ``length`` bits from sub-step ``start`` on, as uint8; 0 before the list."""
         import numpy as np
 
         _check_range(start, length)
@@ -188,6 +193,7 @@ class ListedCode:
         return np.where(inside, listed[index % self.length], 0).astype(np.uint8)
 
     def to_attrs(self) -> dict[str, Any]:
+        """Return the code as the attribute ``code`` of recordings, with all of its bits."""
         return {
             "kind": self.kind,
             "bits": self.digits,

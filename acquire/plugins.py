@@ -1,4 +1,4 @@
-"""Variants that any installed distribution may add: effects, scenes, drivers, solvers, denoisers.
+"""Variants that any installed distribution may add: effects, scenes, drivers, codecs, solvers, denoisers.
 
 Each is a class that an entry point names. Ours are listed in our own pyproject.toml, just as others list
 theirs; PLUGINS.md describes how to write one. A name is looked up without importing anything, and a class is
@@ -60,11 +60,13 @@ class Group:
     name : name of the entry points' group
     what : noun for errors and lists
     base : ``module:class`` that every class of the group extends
+    built_in : names that are known without their classes, and even without an installation
     """
 
     name: str
     what: str
     base: str
+    built_in: tuple[str, ...] = ()
 
     def found(self) -> tuple[Plugin, ...]:
         """Return every entry point of the group, ours first, including refused ones. Imports nothing."""
@@ -126,9 +128,10 @@ class Group:
         named = [plugin for plugin in self.found() if not plugin.refused and plugin.name != without]
         # Ours are not imported for a list: what they lack is an extra, which the error then names.
         usable = [each for each in named if each.distribution == OURS or not self.trouble(each)]
-        return ", ".join(
+        texts = [
             each.name if each.distribution == OURS else f"{each.name} ({each.origin})" for each in usable
-        )
+        ]
+        return ", ".join(dict.fromkeys([*self.built_in, *texts]))
 
 
 EFFECTS = Group("acquire.effects", "effect", "acquire.sim.effects.base:Effect")
@@ -137,8 +140,12 @@ SOLVERS = Group("acquire.solvers", "solver", "acquire.recon.solver:Solver")
 DENOISERS = Group("acquire.denoisers", "denoiser", "acquire.recon.denoisers:Denoiser")
 CAMERAS = Group("acquire.cameras", "camera driver", "acquire.camera.variant:CameraVariant")
 TRIGGERS = Group("acquire.triggers", "trigger driver", "acquire.trigger.variant:TriggerVariant")
+# Every recording needs one of ours: at least for its times and flags.
+CODECS = Group(
+    "acquire.codecs", "codec", "acquire.store.variant:CodecVariant", ("auto", "none", "lz4", "zstd")
+)
 
-GROUPS = (EFFECTS, SCENES, CAMERAS, TRIGGERS, SOLVERS, DENOISERS)
+GROUPS = (EFFECTS, SCENES, CAMERAS, TRIGGERS, CODECS, SOLVERS, DENOISERS)
 
 
 def forget() -> None:
@@ -163,7 +170,9 @@ def _found(group: str) -> tuple[Plugin, ...]:
             theirs.append(Plugin(group, entry.name, name, version, entry))
     # In an order that does not depend on that of the search path.
     theirs.sort(key=lambda each: (each.name, each.distribution))
-    taken = {plugin.name for plugin in ours}
+    taken = {plugin.name for plugin in ours} | {
+        name for each in GROUPS if each.name == group for name in each.built_in
+    }
     for number, plugin in enumerate(theirs):
         origins = [other.origin for other in theirs if other.name == plugin.name]
         if plugin.name in taken:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, Self, cast
 
 from acquire.errors import AcquireError, ConfigError, TriggerError, UsageError
 from acquire.lines import ARMS
-from acquire.plugins import CAMERAS, TRIGGERS, of_others
+from acquire.plugins import CAMERAS, CODECS, TRIGGERS, of_others
 
 if TYPE_CHECKING:
     from types import TracebackType
@@ -84,7 +84,8 @@ class Rig:
         drivers = [(TRIGGERS, config.trigger.driver)]
         if config.simulation.replay is None:  # otherwise no camera is opened
             drivers = [*((CAMERAS, config.cameras.arm(arm).driver) for arm in ARMS), *drivers]
-        return {**origin, "plugins": [*of_others(drivers), *origin.get("plugins", ())]}
+        used = of_others([*drivers, (CODECS, config.recording.codec)])
+        return {**origin, "plugins": [*used, *origin.get("plugins", ())]}
 
     @property
     def layout(self) -> str:

@@ -23,10 +23,12 @@ from acquire.errors import AcquireError, UsageError
 from acquire.geometry import check_integers
 from acquire.lines import ARMS, LineBlock, LineFlag
 from acquire.noise import QUANTISATION_DN2
+from acquire.plugins import CODECS, of_others
 from acquire.reading import path_of
 from acquire.sim.pipeline import Bench, describe
 from acquire.sim.stopwatch import Stopwatch
 from acquire.store import RecordingSpec, RecordingWriter, RunCondition
+from acquire.store.codecs import configured_codec
 from acquire.stream.losses import Cause
 from acquire.stream.tagger import Tagger
 from acquire.text import shown
@@ -249,7 +251,8 @@ def _spec(config: RigConfig, scene: SceneConfig) -> RecordingSpec:
         | config.cameras.arm(arm).noise_facts
         for arm in ARMS
     }
-    recording = config.recording
+    recording, origin = config.recording, describe(scene)
+    origin["plugins"] = [*origin["plugins"], *of_others([(CODECS, recording.codec)])]
     return RecordingSpec(
         run_id=f"{config.name}-simulated",
         stages=config.geometry.stages,
@@ -263,11 +266,11 @@ def _spec(config: RigConfig, scene: SceneConfig) -> RecordingSpec:
         trigger={**trigger, "settings": config.trigger.model_dump(mode="json")},
         cameras=cameras,
         config=config.model_dump(mode="json"),
-        extra=describe(scene) | carried_calibration(config, layout_of(config, scene)).attrs,
+        extra=origin | carried_calibration(config, layout_of(config, scene)).attrs,
         chunk_lines=config.chunk_lines,
         shard_chunks=recording.shard_chunks,
         tag_chunks=config.tag_chunks,
-        codec="lz4" if recording.codec == "auto" else recording.codec,  # no camera has to be kept up with
+        codec=configured_codec(config, auto="lz4"),  # no camera has to be kept up with
         fsync=recording.fsync,
         layout=layout_of(config, scene),
         fibre=config.laid_out,

@@ -62,7 +62,9 @@ class CameraBlock(LineBlock):
 class Camera(Protocol):
     """One camera, opened and set. Calls are bounded in time and raise CameraError."""
 
-    def identify(self) -> CameraIdentity: ...
+    def identify(self) -> CameraIdentity:
+        """Return vendor, model, serial number and firmware, as the camera states them."""
+        ...
 
     def settings(self) -> dict[str, Any]:
         """Return the settings as read back from the camera, under their SFNC names."""

@@ -37,6 +37,7 @@ class GenapiFeatures:
         self._nodes: dict[str, GenapiNode] = {}
 
     def find(self, name: str) -> GenapiNode | None:
+        """Return the feature, looked up once; None if the description has none of that name."""
         if name not in self._nodes:
             from genicam import genapi
 
@@ -47,6 +48,7 @@ class GenapiFeatures:
         return self._nodes[name]
 
     def names(self) -> list[str]:
+        """Return the features of all categories; others are not meant for users."""
         return [name for names in self.categories().values() for name in names]
 
     def categories(self) -> dict[str, list[str]]:
@@ -80,10 +82,12 @@ class GenapiNode:
 
     @property
     def readable(self) -> bool:
+        """Whether the access mode allows reading, which may depend on other features."""
         return self.kind not in ("command", "other") and self._mode in ("RO", "RW")
 
     @property
     def writable(self) -> bool:
+        """Whether the access mode allows writing, which may depend on other features."""
         return self._mode in ("WO", "RW")
 
     @property
@@ -95,6 +99,7 @@ class GenapiNode:
 
     @property
     def selected(self) -> bool:
+        """Whether another feature selects what it is a value of."""
         with translated(self.name):
             return bool(self._node.node.selecting_features)
 
@@ -104,6 +109,7 @@ class GenapiNode:
         return str(self._node.node.tooltip or self._node.node.description)
 
     def read(self) -> Value:
+        """Return the value, possibly from the cache of the node map; see `read_afresh`."""
         with translated(f"read {self.name}"):
             value: Value = self._node.value
             return value
@@ -115,6 +121,7 @@ class GenapiNode:
             self._node.to_string()
 
     def write(self, value: Value) -> None:
+        """Set the value; of a command, True executes it and waits, for a bounded time."""
         with translated(f"set {self.name} to {value!r}"):
             if self.kind != "command":
                 self._node.value = value
@@ -123,12 +130,14 @@ class GenapiNode:
                 await_done(self.name, self._node.is_done)
 
     def limits(self) -> tuple[float, float, float]:
+        """Return minimum, maximum and increment, which is 0 for a float without one."""
         with translated(self.name):
             if self.kind == "integer":
                 return self._node.min, self._node.max, self._node.inc
             return self._node.min, self._node.max, self._node.inc if self._node.has_inc() else 0
 
     def entries(self) -> list[str]:
+        """Return the names of the enumeration's values."""
         with translated(self.name):
             return list(self._node.symbolics)
 
@@ -141,6 +150,7 @@ class Words(logging.Handler):
         self._last: deque[str] = deque(maxlen=3)
 
     def emit(self, record: logging.LogRecord) -> None:
+        """Keep the first line of a message, which for harvesters says what failed."""
         text = record.getMessage().splitlines()
         if text:
             self._last.append(text[0])

@@ -122,10 +122,12 @@ class HarvestersCamera:
             raise
 
     def identify(self) -> CameraIdentity:
+        """Return the identity by which the camera was found."""
         found = self._found
         return CameraIdentity(found.vendor, found.model, found.serial, found.firmware)
 
     def settings(self) -> dict[str, Any]:
+        """Return the settings of all modules as read back now, under their SFNC names."""
         return read_settings(self._features)
 
     def features(self) -> dict[str, GenapiFeatures]:
@@ -133,6 +135,7 @@ class HarvestersCamera:
         return self._features
 
     def arm(self) -> None:
+        """Allocate buffers and start the acquisition."""
         self.disarm()
         found = frame_format(self._features)
         self._views.clear()
@@ -219,6 +222,7 @@ class HarvestersCamera:
         return _or_zero(lambda: self._stream.module.num_underrun)
 
     def release(self, block: CameraBlock) -> None:
+        """Queue the block's buffer again, unless its acquisition has ended."""
         buffer = self._assembly.release(block) if self._assembly else None
         # A stopped stream has its buffers back: queueing one of them again is an error.
         if buffer is not None and self._armed:
@@ -249,9 +253,11 @@ class HarvestersCamera:
                 step()
 
     def statistics(self) -> dict[str, int]:
+        """Return the counters since arm; all 0 before the first one."""
         return self._assembly.statistics() if self._assembly else dict.fromkeys(STATISTICS, 0)
 
     def close(self) -> None:
+        """Stop, and close device, producer and library. Idempotent."""
         self.disarm()
         self._features = {}
         self._acquirer = None

@@ -28,16 +28,22 @@ _WAIT_S = 0.1
 class FeatureTree(Protocol):
     """The features of one module by category."""
 
-    def find(self, name: str) -> Node | None: ...
+    def find(self, name: str) -> Node | None:
+        """Return the feature of that name; None if there is none."""
+        ...
 
-    def categories(self) -> Mapping[str, list[str]]: ...
+    def categories(self) -> Mapping[str, list[str]]:
+        """Return category → its features, in the order of the camera's description."""
+        ...
 
 
 @runtime_checkable
 class FeatureCamera(Protocol):
     """A camera that can show its features."""
 
-    def features(self) -> Mapping[str, FeatureTree]: ...
+    def features(self) -> Mapping[str, FeatureTree]:
+        """Return module (``remote``, ``stream`` …) → its features."""
+        ...
 
 
 def facts(camera: Camera, _: Callable[[], None]) -> dict[str, Any]:

@@ -68,17 +68,23 @@ class Node(Protocol):
     kind: Kind
 
     @property
-    def readable(self) -> bool: ...
+    def readable(self) -> bool:
+        """Whether it has a value that can be read now; a command has none."""
+        ...
 
     @property
-    def writable(self) -> bool: ...
+    def writable(self) -> bool:
+        """Whether it can be set, or executed, now: many features are locked while lines are taken."""
+        ...
 
     @property
     def selected(self) -> bool:
         """Whether its value depends on a selector."""
         ...
 
-    def read(self) -> Value: ...
+    def read(self) -> Value:
+        """Return the value, in the type of its `kind`."""
+        ...
 
     def write(self, value: Value) -> None:
         """Set the value; execute a command and wait, for a bounded time, until it is done."""
@@ -96,9 +102,13 @@ class Node(Protocol):
 class Features(Protocol):
     """The features of one module."""
 
-    def find(self, name: str) -> Node | None: ...
+    def find(self, name: str) -> Node | None:
+        """Return the feature of that name; None if the module has none."""
+        ...
 
-    def names(self) -> list[str]: ...
+    def names(self) -> list[str]:
+        """Return the names of all features, for guesses at what was meant."""
+        ...
 
 
 def apply_settings(settings: Iterable[Setting], modules: Mapping[str, Features]) -> None:

@@ -16,6 +16,7 @@ from acquire.config.recording import usual_chunk_lines, usual_tag_chunks
 from acquire.errors import StateError, UsageError
 from acquire.lines import ARMS
 from acquire.store import RecordingSpec
+from acquire.store.codecs import configured_codec
 from acquire.store.files import locked
 from acquire.store.shape import CODECS
 from acquire.trigger.base import TriggerRun
@@ -23,7 +24,7 @@ from acquire.trigger.base import TriggerRun
 if TYPE_CHECKING:
     from acquire.clock import ClockFit
     from acquire.config import RigConfig
-    from acquire.store.shape import Codec
+    from acquire.store.shape import Codec, OwnCodec
 
 CLOCK_HZ = 90_000_000
 
@@ -46,11 +47,10 @@ class Load:
     fsync: Literal["commit", "seal"] = "seal"
 
     @classmethod
-    def of(cls, config: RigConfig, chosen: Codec | None = None) -> Load:
+    def of(cls, config: RigConfig, chosen: OwnCodec | None = None) -> Load:
         """Return the load of a rig; ``chosen`` is the codec to use if the rig's is ``auto``."""
         stream, recording = config.stream, config.recording
-        codec = chosen if recording.codec == "auto" else recording.codec
-        if codec is None:
+        if recording.codec == "auto" and chosen is None:
             raise UsageError(
                 "a load cannot have the codec 'auto'", possible=", ".join(CODECS), hint="choose one first"
             )
@@ -65,7 +65,7 @@ class Load:
             chunk_lines=config.chunk_lines,
             shard_chunks=recording.shard_chunks,
             commit_s=recording.commit_s,
-            codec=codec,
+            codec=configured_codec(config, auto=chosen or "none"),
             fsync=recording.fsync,
         )
 

@@ -160,7 +160,7 @@ def _facts(load: Load, parts: Parts, trials: list[RateTrial], found: RateTrial |
     return {
         "pixels": load.pixels,
         "dtype": load.dtype,
-        "codec": load.codec,
+        "codec": str(load.codec),
         "configured_hz": load.line_rate_hz,
         "limits_hz": parts.limits,
         "highest_hz": None if found is None else found.line_rate_hz,

@@ -54,7 +54,7 @@ COMMANDS = (
     Listed("config", "config", RIG, "list, check and show configurations"),
     Listed("devices", "devices", RIG, "list triggers and cameras, and any problem with them"),
     Listed("doctor", "doctor", RIG, "check whether this host is fit to capture"),
-    Listed("plugins", "plugins", RIG, "list the installed effects, scenes, drivers and solvers"),
+    Listed("plugins", "plugins", RIG, "list the installed effects, scenes, drivers, codecs and solvers"),
     Listed("completion", "completion", RIG, "print the script for Tab completion"),
     Listed("install-service", "install_service", RIG, "print or install the systemd unit"),
     Listed("trigger", "trigger", RIG, "operate the sync trigger directly"),

@@ -19,7 +19,7 @@ def register(app: typer.Typer) -> None:
 
 
 def plugins(json: JsonFlag = False) -> None:
-    """List every effect, scene, driver, solver and denoiser, with its package and whether it works.
+    """List every effect, scene, driver, codec, solver and denoiser, with its package and whether it works.
 
     Packages installed in the same environment can add plug-ins (PLUGINS.md). A plug-in that cannot be
     imported is listed here with its error and left out everywhere else.

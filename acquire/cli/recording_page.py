@@ -101,6 +101,7 @@ def recording_facts(facts: dict[str, Any]) -> dict[str, Any]:
         "geometry": f"M = {sizes['stages']}, S = {sizes['substeps']}, {sizes['pixels']} pixels",
         "scene": _behind_fibre(sizes),
         "samples": facts["dtype"],
+        "not readable": facts["codec_missing"],
         # Listed bits may be a megabyte of digits. Without a seed, the register's state was given itself.
         "code": ", ".join(
             f"{key} {shortened(value, 60)}" for key, value in facts["code"].items() if value is not None

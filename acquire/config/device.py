@@ -206,6 +206,7 @@ class CameraConfig(FrozenModel):
 
     @property
     def bits(self) -> int:
+        """Significant bits of a pixel."""
         return PIXEL_BITS[self.pixel_format]
 
     @property
@@ -215,6 +216,7 @@ class CameraConfig(FrozenModel):
 
     @property
     def dtype(self) -> Literal["uint8", "uint16"]:
+        """Type of a pixel in memory and on disk, where 10 and 12 bits take 16."""
         return "uint8" if self.bits == 8 else "uint16"
 
 
@@ -230,6 +232,7 @@ class CamerasConfig(FrozenModel):
     b: CameraConfig
 
     def arm(self, name: str) -> CameraConfig:
+        """Return the camera of an arm, ``"a"`` or ``"b"``."""
         return {"a": self.a, "b": self.b}[name]
 
     @model_validator(mode="after")

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 from urllib.parse import urlsplit
 
 from pydantic import Field, field_validator
 
 from acquire.config.base import FilePath, FrozenModel, Seconds
+from acquire.config.variants import NameOf, OptionsOf
+from acquire.plugins import CODECS
 
 MOST_GB = 1e9
 """An exabyte."""
@@ -70,9 +72,13 @@ class RecordingConfig(FrozenModel):
     # The index of 255 chunks fits one page. 240 has twenty divisors: chunks of tags, of which a shard holds
     # a whole number, can have nearly any length.
     shard_chunks: int = Field(default=240, ge=1, le=255, description="chunks per file")
-    codec: Literal["none", "lz4", "zstd", "auto"] = Field(
+    codec: Annotated[str, NameOf(CODECS)] = Field(
         default="none",
-        description="'auto': the strongest compression that sustains the rate on this host, measured at arm",
+        description="'none', 'lz4', 'zstd'; 'auto': the strongest of these that sustains the rate on this "
+        "host, measured at arm; or one that `acquire plugins` lists",
+    )
+    codec_options: Annotated[FrozenModel | None, OptionsOf(CODECS, named_by="codec")] = Field(
+        default=None, validate_default=True, description="options of the codec"
     )
     fsync: Literal["commit", "seal"] = Field(
         default="seal", description="when bytes are forced to the medium"

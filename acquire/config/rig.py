@@ -49,6 +49,7 @@ class GeometryConfig(FrozenModel):
     substeps: int = Field(ge=1, le=8, description="S, charge-transfer steps per line")
 
     def segment(self, lines: int) -> Geometry:
+        """Return the geometry of a segment of ``lines`` lines."""
         return Geometry(self.stages, self.substeps, lines)
 
 
@@ -75,6 +76,7 @@ class PrbsConfig(FrozenModel):
         return self
 
     def build(self) -> Code:
+        """Return the code: of the state, if there is one, else of the seed."""
         if self.state is not None:
             return PrbsCode(self.degree, int(self.state, 16))
         return PrbsCode.from_seed(self.degree, self.seed)
@@ -87,6 +89,7 @@ class ConstantCodeConfig(FrozenModel):
     value: Literal[0, 1] = 1
 
     def build(self) -> Code:
+        """Return the code of a light that is always on, or off."""
         return ConstantCode(self.value)
 
 
@@ -424,6 +427,7 @@ class RigConfig(FrozenModel):
 
     @property
     def line_rate_hz(self) -> float:
+        """Lines per second of each arm, by the trigger's clock."""
         return self.trigger.clock_hz / self.line_period_ticks
 
     @property

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from acquire.config.variants import GROUP_KEY
+from acquire.config.variants import GROUP_KEY, NAMED_BY_KEY
 from acquire.plugins import GROUPS
 
 if TYPE_CHECKING:
@@ -18,8 +18,8 @@ _GROUPS = {group.name: group for group in GROUPS}
 def whole_schema(model: type[BaseModel]) -> dict[str, Any]:
     """Return the JSON schema of a model, including the classes of every group that its tables may use.
 
-    A table with a ``kind`` is one of the group's classes; ``options`` are those of the ``driver`` next to
-    them. Classes that cannot be imported are left out.
+    A table with a ``kind`` is one of the group's classes; options are those of the class that the key next
+    to them names. Classes that cannot be imported are left out.
     """
     schema = model.model_json_schema()
     definitions = schema.setdefault("$defs", {})
@@ -53,18 +53,19 @@ def _resolve_marks(node: Any) -> Iterator[str]:
             yield from _resolve_marks(value)
     if not isinstance(node, dict):
         return
-    options = node.get("properties", {}).get("options", {})
-    if GROUP_KEY in options:
-        name = options.pop(GROUP_KEY)
-        options.pop("default", None)  # the default is the driver's own
-        # A table without a driver has the default one, which an editor need not know.
-        node["allOf"] = [
+    for key, options in node.get("properties", {}).items():
+        if NAMED_BY_KEY not in options:
+            continue
+        name, named_by = options.pop(GROUP_KEY), options.pop(NAMED_BY_KEY)
+        options.pop("default", None)  # the default is the class's own
+        # A table that names no class has the default one, which an editor need not know.
+        node.setdefault("allOf", []).extend(
             {
-                "if": {"properties": {"driver": {"const": driver}}, "required": ["driver"]},
-                "then": {"properties": {"options": {"$ref": f"#/$defs/{name}.{driver}"}}},
+                "if": {"properties": {named_by: {"const": each}}, "required": [named_by]},
+                "then": {"properties": {key: {"$ref": f"#/$defs/{name}.{each}"}}},
             }
-            for driver in _GROUPS[name].working()
-        ]
+            for each in _GROUPS[name].working()
+        )
         yield name
     if GROUP_KEY in node:
         name = node.pop(GROUP_KEY)

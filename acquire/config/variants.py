@@ -20,6 +20,8 @@ if TYPE_CHECKING:
 
 GROUP_KEY = "x-acquire-group"
 """Marks the place of a group's classes in an incomplete JSON schema (`acquire.config.schema`)."""
+NAMED_BY_KEY = "x-acquire-named-by"
+"""Marks the options of a class, in such a schema, with the key that names the class."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,18 +80,20 @@ class NameOf:
         schema: core_schema.CoreSchema,
         handler: GetJsonSchemaHandler,
     ) -> JsonSchemaValue:
-        return {"type": "string", "enum": list(self.group.names())}
+        return {"type": "string", "enum": list(dict.fromkeys([*self.group.built_in, *self.group.names()]))}
 
     def _known(self, name: str) -> str:
-        _class_of(self.group, name)
+        if name not in self.group.built_in:
+            _class_of(self.group, name)
         return name
 
 
 @dataclass(frozen=True, slots=True)
 class OptionsOf:
-    """Annotates ``options``, a table of the class that the preceding field ``driver`` names."""
+    """Annotates a table of the options of the class that a preceding field names: ``driver``, or another."""
 
     group: Group
+    named_by: str = "driver"
 
     def __get_pydantic_core_schema__(
         self,
@@ -105,12 +109,17 @@ class OptionsOf:
         schema: core_schema.CoreSchema,
         handler: GetJsonSchemaHandler,
     ) -> JsonSchemaValue:
-        return {"type": "object", GROUP_KEY: self.group.name}
+        return {"type": "object", GROUP_KEY: self.group.name, NAMED_BY_KEY: self.named_by}
 
     def _validated(self, value: Any, info: core_schema.ValidationInfo) -> Any:
-        driver = info.data.get("driver")
+        driver = info.data.get(self.named_by)
         if driver is None:
             return None  # the driver itself was refused, which is already an error
+        if driver in self.group.built_in:
+            if value:
+                what = f"{self.group.what} {driver!r}"
+                raise PydanticCustomError("no_options", "{what} has no options", {"what": what})
+            return None
         # Also for a table that is absent: its model then has the defaults, or refuses what it requires.
         model = _class_of(self.group, driver)
         if isinstance(value, model):

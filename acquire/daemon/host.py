@@ -19,6 +19,7 @@ from acquire.daemon.storage import storage_settings
 from acquire.errors import ConfigError, UsageError
 from acquire.lines import ARMS
 from acquire.store import RecordingSpec
+from acquire.store.codecs import configured_codec
 
 if TYPE_CHECKING:
     from acquire.config import RigConfig
@@ -77,7 +78,6 @@ def _check_spec(config: RigConfig) -> None:
         | {"white_dn": config.cameras.arm(arm).white_dn}
         for arm in ARMS
     }
-    codec = config.recording.codec
     try:
         RecordingSpec(
             run_id="check",
@@ -92,7 +92,7 @@ def _check_spec(config: RigConfig) -> None:
             trigger={},
             cameras=cameras,
             config=config.model_dump(mode="json"),
-            codec="none" if codec == "auto" else codec,
+            codec=configured_codec(config, auto="none"),
             layout=config.cameras.layout,
             fibre=config.laid_out,
             **storage_settings(config),

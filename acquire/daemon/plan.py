@@ -16,6 +16,7 @@ from acquire.daemon.messages import CalibrationStatus
 from acquire.daemon.storage import choose_for, storage_settings
 from acquire.daemon.watching import watch_plan
 from acquire.store import RecordingSpec, next_segment
+from acquire.store.codecs import configured_codec
 from acquire.stream import END_S, Begin, Capture, CapturePlan
 from acquire.trigger.base import Delays, LightWindow, TriggerRun
 from acquire.trigger.settings import with_delays, with_window
@@ -82,10 +83,8 @@ class Run:
     def spec(self) -> RecordingSpec:
         """Return the recording's specification; the recorder fills in its first line."""
         config = self._config
-        codec = config.recording.codec
-        if codec == "auto":
-            # Chosen by `arm`. Before that there is none, and nothing that it could pack.
-            codec = self._choice.codec if self._choice else "none"
+        # Chosen by `arm`. Before that there is none, and nothing that it could pack.
+        codec = configured_codec(config, auto=self._choice.codec if self._choice else "none")
         return RecordingSpec(
             run_id=self.run_id,
             stages=config.geometry.stages,
@@ -162,6 +161,8 @@ def worker_modules(rig: Rig) -> tuple[str, ...]:
     modules |= {f"acquire.stream.{name}" for name in ("recorder", "grabber", "watcher")}
     if rig.config.simulates_cameras:
         modules.add("acquire.sim.pipeline")  # imported by simulated cameras when they are opened
+    if (codec := rig.config.recording.codec_options) is not None:
+        modules.add(type(codec).__module__)
     return tuple(sorted(modules))
 
 

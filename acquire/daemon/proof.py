@@ -88,7 +88,7 @@ class Proof:
             log.warning("capacity: %s", warning)
         return CapacityStatus(
             line_rate_hz=load.line_rate_hz,
-            codec=load.codec,
+            codec=str(load.codec),
             sustained_hz=round(parts.line_rate_hz),
             limit=parts.limit,
             limits_hz={name: round(rate) for name, rate in parts.limits.items()},

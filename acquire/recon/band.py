@@ -269,9 +269,11 @@ class InBasis:
             self._operator = GatheredArms(*case, arrays, alignment=alignment, blur=blur)
 
     def forward(self, theta: Array) -> Array:
+        """Return the lines of coefficients."""
         return self._operator.forward(self._basis.synthesize(theta))
 
     def adjoint(self, lines: Array) -> Array:
+        """Return the coefficients of the transpose."""
         return self._basis.analyze(self._operator.adjoint(lines))
 
 

@@ -44,10 +44,14 @@ class Basis(Protocol):
     """Orthonormal rows D (K, T) along the frames' time."""
 
     @property
-    def frames(self) -> int: ...
+    def frames(self) -> int:
+        """T, the frames of the video."""
+        ...
 
     @property
-    def count(self) -> int: ...
+    def count(self) -> int:
+        """K, the coefficients that the solver holds instead of T frames."""
+        ...
 
     @property
     def cosines(self) -> int:
@@ -64,15 +68,21 @@ class Basis(Protocol):
         """Library and device of coefficients and videos; D itself is on the host, in their dtype."""
         ...
 
-    def matrix(self, grid: int | None = None) -> NDArray[Any]: ...
+    def matrix(self, grid: int | None = None) -> NDArray[Any]:
+        """Return D (K, T), or at ``grid`` equidistant instants, on which the sign of the light is checked."""
+        ...
 
     def spread(self, theta: Array) -> Array:
         """Coefficients of the cosines, (count, …) → (cosines, …)."""
         ...
 
-    def synthesize(self, theta: Array) -> Array: ...
+    def synthesize(self, theta: Array) -> Array:
+        """Return the video Dᵀ·θ (T, n′, n′) of coefficients θ (K, n′, n′)."""
+        ...
 
-    def analyze(self, video: Array) -> Array: ...
+    def analyze(self, video: Array) -> Array:
+        """Return D·x (K, n′, n′), the coefficients of the nearest video that the basis holds."""
+        ...
 
 
 class TemporalBasis:

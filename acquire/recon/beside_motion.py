@@ -89,19 +89,23 @@ class PatternsAndMotion:
         self._volume_operator = segment_operator(given.segment, self._slow, *given.merges)
 
     def stacked(self, found: Patterns) -> Array:
+        """Return volume and patterns in one array, flat, since their shapes differ."""
         asarray = self._given.problem.arrays.asarray  # what a refinement begins with is on the host
         return self._layout(found).joined(asarray(found.motion), asarray(found.patterns))
 
     def unstacked(self, theta: Array, found: Patterns) -> Patterns:
+        """Return the patterns with the volume, which a next round begins with."""
         motion, patterns = self._layout(found).parts(theta)
         return Patterns(found.curves, patterns, motion)
 
     def operator(self, patterns: Operator, found: Patterns) -> Operator:
+        """Return the sum of both operators, the volume's in few cosines."""
         return JoinedOperator(self._layout(found), self._volume_operator, patterns)
 
     def priors(
         self, found: Patterns, basis: LearnedBasis, parameters: AdmmParameters, /, *, emphasis: Array
     ) -> dict[str, Any]:
+        """Return a prior and a sign for each part: the volume's prior also acts in time."""
         layout = self._layout(found)
         parts = layout.parts(self.stacked(found))
         volume = SignSplit(Admm.grid_of(self._slow, parameters), parts[0], None)
@@ -114,9 +118,11 @@ class PatternsAndMotion:
         }
 
     def other_lines(self, found: Patterns) -> Array:
+        """Return the volume's lines, which the curves are fitted beside."""
         return self._volume_operator.forward(found.motion)
 
     def other_video(self, found: Patterns) -> NDArray[Any]:
+        """Return the frames (T, n′, n′) of the volume."""
         return host(self._slow.synthesize(found.motion))
 
     def _layout(self, found: Patterns) -> JoinedLayout:

@@ -25,12 +25,15 @@ class ChosenEstimate:
         self.held_out_error: float | None = trial.error
 
     def predict(self) -> NDArray[Any]:
+        """Return the lines of the trial and of the still that it is a change of, if any."""
         return self._bench.predict(self._trial)
 
     def video(self) -> NDArray[Any]:
+        """Return the frames (T, n′, n′), with the still that they are a change of."""
         return self._bench.video(self._trial)
 
     def facts(self) -> dict[str, Any]:
+        """Return the chosen prior, its weight and its band, and the record of all candidates."""
         chosen, basis = asdict(self._trial.candidate), self._trial.basis
         del chosen["coefficients"]
         chosen["temporal_coefficients"] = basis.cosines
@@ -39,6 +42,7 @@ class ChosenEstimate:
         return chosen | {"candidates": self._bench.record}
 
     def continue_with(self, problem: Problem, heavier: float = 1.0, *, still: bool = False) -> ContinuedTrial:
+        """Continue the trial and, with ``still``, the still below it; neither changes here."""
         background = self._bench.still if still else None
         return ContinuedTrial(
             self._bench,
@@ -54,11 +58,13 @@ class ContinuedTrial:
         self._bench, self._trial, self._still = bench, trial, still
 
     def step(self) -> None:
+        """Make an iteration of the trial and, if that continues, one of its still."""
         self._trial.admm.step()
         if self._still is not None:
             self._still.admm.step()
 
     def video(self) -> NDArray[Any]:
+        """Return the frames (T, n′, n′) so far, relative to the still as it is by now."""
         if self._still is None:
             return self._bench.video(self._trial)
         bench = self._bench.with_problem(self._bench.problem, still=self._still)

@@ -70,6 +70,7 @@ class IterationClock:
 
     @property
     def seconds(self) -> float:
+        """Wall time since the call began, without compilation: the time that a budget limits."""
         return time.monotonic() - self._began - self.compiled_s - self._excluded_s
 
     @property

@@ -51,17 +51,20 @@ def with_light_missing(given: Given, refinement: Refinement, lit: NDArray[np.boo
     The residual, taken back to the patterns, is compared with the same residual with random signs: noise is
     as likely with either sign, but light that is missing has the same sign in all its lines.
     """
+    # The same draws every time: equal lines give equal videos.
     problem, rng = given.problem, np.random.default_rng(0)
     residual = np.where(problem.weight > 0, problem.samples - refinement.predict(), 0)
     light = _taken_back(refinement, residual)
     draws = [_taken_back(refinement, residual * rng.choice([-1, 1], residual.shape)) for _ in range(DRAWS)]
     variance = uniform_filter(np.mean(np.square(draws), 0), (0, SAME_NOISE, SAME_NOISE))
+    # No line sees some of the pixels: without noise or light, they are no evidence.
     variance += np.finfo(variance.dtype).tiny
 
     def relative(each: NDArray[Any]) -> NDArray[Any]:
         squares: NDArray[Any] = (np.square(each) / variance).sum(0)
         return squares
 
+    # Thousands of pixels are compared: what noise reaches in any of them, in any draw, is no light.
     chance = max(relative(draw)[~lit].max(initial=0) for draw in draws)
     return lit | _with_neighbours(~lit & (relative(light) > chance))
 
@@ -97,10 +100,12 @@ class LitPixels:
         self.other_lines, self.other_video = unknowns.other_lines, unknowns.other_video
 
     def unstacked(self, theta: Array, found: Patterns) -> Patterns:
+        """Return the patterns with 0 in the pixels that are dark."""
         every = self.free.unstacked(theta, found)
         return replace(every, patterns=every.patterns * self._lit)
 
     def operator(self, patterns: Operator, found: Patterns, /) -> Operator:
+        """Return the operator of the lit pixels alone."""
         return self.free.operator(_InLitPixels(patterns, self._lit), found)
 
 

@@ -30,7 +30,9 @@ if TYPE_CHECKING:
 class Denoiser(Protocol):
     """Denoises frames (K, row, column) with a strength ``weight``, in the units of TV's."""
 
-    def prox(self, frames: Array, weight: float | Array, /) -> Array: ...
+    def prox(self, frames: Array, weight: float | Array, /) -> Array:
+        """Return frames (K, n′, n′) without noise of standard deviation ``weight``; 0 changes nothing."""
+        ...
 
 
 def open_denoiser(name: str) -> Denoiser:

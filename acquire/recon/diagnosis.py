@@ -70,6 +70,7 @@ class Diagnosis:
         return (*named, *(each.words for each in self.suspicions))
 
     def to_dict(self) -> dict[str, Any]:
+        """Return the diagnosis as JSON, as ``acquire diagnose --json`` prints it."""
         return {
             "standing": str(self.standing),
             "sentence": self.sentence,

@@ -27,19 +27,28 @@ class Estimate(Protocol):
     held_out_error: float | None
     """Relative error of the held-out samples before they were put to use; None: that of `predict`."""
 
-    def predict(self) -> NDArray[Any]: ...
+    def predict(self) -> NDArray[Any]:
+        """Return the lines (2, L_R, M) of the video in units of the problem's samples, also masked ones."""
+        ...
 
-    def video(self) -> NDArray[Any]: ...
+    def video(self) -> NDArray[Any]:
+        """Return the video (T, n′, n′) in units of the problem's ``scale``, possibly below 0."""
+        ...
 
-    def facts(self) -> dict[str, Any]: ...
+    def facts(self) -> dict[str, Any]:
+        """Return what a user may want to know of the solution, as JSON: `Reconstruction.parameters`."""
+        ...
 
 
 class ContinuingSolver(Protocol):
     """A solver that continues an estimate: `step` is an iteration, `video` the dimensionless video so far."""
 
-    def step(self) -> None: ...
+    def step(self) -> None:
+        """Make one iteration, which changes `video`."""
 
-    def video(self) -> NDArray[Any]: ...
+    def video(self) -> NDArray[Any]:
+        """Return the dimensionless video (T, n′, n′) so far."""
+        ...
 
 
 @runtime_checkable
@@ -74,12 +83,15 @@ class InBand:
         self.basis, self._operator, self._problem = basis, operator, problem
 
     def predict(self) -> NDArray[Any]:
+        """Return the lines that the coefficients predict; they were scaled to an operator of norm 1."""
         return host(self._operator.forward(self.solver.theta)) / self._problem.norm
 
     def video(self) -> NDArray[Any]:
+        """Return the frames (T, n′, n′), which the solver itself never holds."""
         return host(self.basis.synthesize(self.solver.theta))
 
     def facts(self) -> dict[str, Any]:
+        """Return the band that the video can hold, as runs of cosines, and the solver's parameters."""
         held = self.basis.held
         last = np.flatnonzero(np.diff(held, append=held[-1] + 2) > 1)
         first = np.concatenate([[0], last[:-1] + 1])
@@ -88,6 +100,7 @@ class InBand:
         return {"temporal_coefficients": self.basis.cosines, "bands": bands} | asdict(self._parameters)
 
     def step(self) -> None:
+        """Continue the solver by one iteration."""
         self.solver.step()
 
     def continue_with(
@@ -113,12 +126,15 @@ class Refined:
         self._refinement, self._coefficients = refinement, coefficients
 
     def predict(self) -> NDArray[Any]:
+        """Return the lines of patterns, curves and all that is beside them."""
         return self._refinement.predict()
 
     def video(self) -> NDArray[Any]:
+        """Return the sum of curve · pattern (T, n′, n′), and of what is beside it."""
         return self._refinement.video()
 
     def facts(self) -> dict[str, Any]:
+        """Return the numbers of patterns and of coefficients, and the share of ground taken to be dark."""
         found: dict[str, Any] = {
             "temporal_coefficients": self._coefficients,
             "patterns": self._refinement.rank,
@@ -137,6 +153,7 @@ class Refined:
         *,
         still: bool = False,  # noqa: ARG002 (the protocol's; nothing here is added to a still)
     ) -> Refinement:
+        """Return a refinement that continues from here with another problem's samples and a heavier prior."""
         return self._refinement.with_problem(problem, heavier)
 
 
@@ -148,11 +165,13 @@ class Preferred:
         self.predict, self.video = estimate.predict, estimate.video
 
     def facts(self) -> dict[str, Any]:
+        """Return the facts of the estimate, with the candidates that lost against it."""
         return self._estimate.facts() | {"prior": "cosines", "candidates": self._record}
 
     def continue_with(
         self, problem: Problem, heavier: float = 1.0, *, still: bool = False
     ) -> ContinuingSolver | None:
+        """Continue the estimate, if that is possible."""
         if not isinstance(self._estimate, Continuable):
             return None
         return self._estimate.continue_with(problem, heavier, still=still)

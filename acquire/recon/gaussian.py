@@ -194,6 +194,7 @@ class Model:
 
     @property
     def pixels(self) -> int:
+        """Voxels of one frame."""
         return len(self._pixel_values)
 
     def modes(self, lines: Floats) -> Floats:

@@ -57,10 +57,12 @@ class JoinedOperator:
         self._layout, self._volume, self._patterns = layout, volume, patterns
 
     def forward(self, theta: Array) -> Array:
+        """Return the lines (2, L_R, M) of volume and patterns together."""
         volume, patterns = self._layout.parts(theta)
         return self._volume.forward(volume) + self._patterns.forward(patterns)
 
     def adjoint(self, lines: Array) -> Array:
+        """Return both parts of the transpose, the volume's in the scale in which it is stored."""
         # θ₁ is stored s times too large.
         volume = self._volume.adjoint(lines) / self._layout.scale**2
         return self._layout.joined(volume, self._patterns.adjoint(lines))
@@ -73,13 +75,16 @@ class JoinedSign:
         self._layout, self._volume, self._patterns = layout, volume, patterns
 
     def advance(self, theta: Array) -> None:
+        """Advance each split with its own part of θ."""
         for split, part in zip((self._volume, self._patterns), self._layout.parts(theta), strict=True):
             split.advance(part)
 
     def pull(self) -> Array:
+        """Return the pull of both splits in one array."""
         return self._layout.joined(self._volume.pull(), self._patterns.pull())
 
     def rescale(self, factor: float) -> None:
+        """Rescale both: volume and patterns have the same ρ."""
         self._volume.rescale(factor)
         self._patterns.rescale(factor)
 
@@ -88,10 +93,12 @@ class JoinedSign:
         self._patterns.rebase(grid, self._layout.patterns)
 
     def resume(self, other: JoinedSign) -> None:
+        """Take over both splits of another joined one."""
         self._volume.resume(other._volume)
         self._patterns.resume(other._patterns)
 
     def copied(self) -> JoinedSign:
+        """Return one whose splits advance independently."""
         other = copy(self)
         other._volume, other._patterns = self._volume.copied(), self._patterns.copied()
         return other
@@ -106,6 +113,7 @@ class JoinedPrior:
         self._layout, self._denoisers, self._weights = layout, denoisers, weights
 
     def prox(self, frames: Array, weight: float | Array) -> Array:
+        """Apply each denoiser to its part: they have priors of different kinds, and weights of their own."""
         each = zip(self._denoisers, self._layout.parts(frames), self._weights, strict=True)
         volume, patterns = (denoiser.prox(part, weight * own) for denoiser, part, own in each)
         return self._layout.joined(volume, patterns)

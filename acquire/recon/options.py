@@ -28,7 +28,9 @@ NEGATIVE_SHARE = 0.01
 class Stop(Protocol):
     """Stop request, checked after every iteration; a `threading.Event` is one."""
 
-    def is_set(self) -> bool: ...
+    def is_set(self) -> bool:
+        """Return whether to end with the best estimate so far."""
+        ...
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -189,24 +189,28 @@ class PatternsAlone:
     share, loosens = 1.0, True
 
     def stacked(self, found: Patterns) -> Array:
+        """Return the patterns (K, n′, n′) themselves."""
         return found.patterns
 
     def unstacked(self, theta: Array, found: Patterns) -> Patterns:
+        """Return θ with the curves it was solved for."""
         return Patterns(found.curves, theta)
 
     def operator(self, patterns: Operator, _found: Patterns, /) -> Operator:
+        """Return the operator of the patterns itself."""
         return patterns
 
     def priors(
         self, _found: Patterns, _basis: LearnedBasis, _parameters: AdmmParameters, /, *, emphasis: Array
     ) -> dict[str, Any]:
+        """Return the emphasis alone: sign and total variation are those that `Admm` has anyway."""
         return {"emphasis": emphasis}
 
     def other_lines(self, _found: Patterns, /) -> None:
-        return None
+        """Return None: nothing else makes lines."""
 
     def other_video(self, _found: Patterns, /) -> None:
-        return None
+        """Return None: nothing else is in the video."""
 
 
 PATTERNS_ALONE = PatternsAlone()

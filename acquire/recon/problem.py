@@ -35,9 +35,13 @@ Statistics), and the ratio of the standard deviation to the median absolute valu
 class Operator(Protocol):
     """A linear map to lines (2, L_R, M) with its transpose."""
 
-    def forward(self, x: Array, /) -> Array: ...
+    def forward(self, x: Array, /) -> Array:
+        """Return the lines (2, L_R, M) of x, which may be a video or the coefficients of one."""
+        ...
 
-    def adjoint(self, y: Array, /) -> Array: ...
+    def adjoint(self, y: Array, /) -> Array:
+        """Return the transpose applied to lines, in the shape of x."""
+        ...
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -155,9 +159,11 @@ class MaskedOperator:
     weight: Array
 
     def forward(self, x: Array) -> Array:
+        """Return lines that are 0 where a sample is not used."""
         return self.operator.forward(x) * self.weight
 
     def adjoint(self, y: Array) -> Array:
+        """Return the transpose, on which samples that are not used have no influence."""
         return self.operator.adjoint(y * self.weight)
 
     def near_inverse(self, damping: float) -> Callable[[Array], Array] | None:

@@ -82,16 +82,20 @@ def pursue(
         light = look.light(lamps)
         dark[lamps[light < DARK]] = True
         lamps, light = lamps[light >= DARK], light[light >= DARK]
+        # All that stood out were sidelobes: as soon as they had coefficients, they went dark.
         if made and not len(lamps):
             return None
         sure = lamps[light >= max(LAMP, FAINT * light.max(initial=0))]
+        # Asked for once, and only where there are lamps: the covariance takes its time.
         if told is None and len(sure):
             told = _beyond(fastest_lamp(), sure.max(), fastest)
         if made == LOOKS - 1 or (len(sure) and has_clear_patterns(look.estimate)):
             break
         energy = residual_energy(look.estimate.predict())
+        # Most of those that are not solved for hold noise alone, and so their median does.
         usual = np.median(np.delete(energy, look.kept))
         ratio = energy / max(usual, np.finfo(np.float64).tiny)
+        # Those that are solved for leave nothing, and dark ones have had their turn.
         ratio[look.kept] = ratio[dark] = 0
         found = _peaks(ratio)
         if not made and not len(found):
@@ -146,6 +150,7 @@ class _Look:
     def light(self, lamps: NDArray[np.int64]) -> NDArray[np.float64]:
         """The largest energy about each lamp, relative to that of the faster half of the slow cosines."""
         energy = np.square(host(self.estimate.solver.theta), dtype=np.float64).sum((1, 2))
+        # The slowest cosines hold the mean of the scene, which would hide any lamp.
         usual = np.median(energy[FEWEST_COEFFICIENTS // 2 : FEWEST_COEFFICIENTS])
         near = [energy[np.abs(self.kept - lamp) <= BESIDE].max() for lamp in lamps]
         relative: NDArray[np.float64] = np.array(near) / max(usual, np.finfo(np.float64).tiny)
@@ -158,6 +163,7 @@ class _Look:
         to a cosine explains the used samples, and no others.
         """
         light, problem = self.light(lamps), self.given.problem
+        # The RMS of n samples of noise varies by 1/√(2n) of itself.
         limit = 1 + BEYOND_CHANCE / np.sqrt(2 * max(1, problem.held_out.sum()))
         error = problem.prediction_error(self.estimate.predict())
 

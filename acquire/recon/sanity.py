@@ -53,6 +53,7 @@ def unusable(segment: Segment) -> list[Suspicion]:
             continue
         known = np.where(mask, lines, np.nan)
         seen = np.isfinite(known).any(0)
+        # Columns without a usable sample have neither: numpy warns of them.
         lowest, highest = np.nanmin(known[:, seen], axis=0), np.nanmax(known[:, seen], axis=0)
         # A single line cannot change, and darkness does not.
         if segment.geometry.lines == 1 or not highest.any():

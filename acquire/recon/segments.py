@@ -223,10 +223,12 @@ class Grid:
 
     @property
     def frames(self) -> int:
+        """Frames of the whole range; the last one may be shorter than T_m sub-steps."""
         return -(-(self.end - self.begin) // self.voxels.temporal_merge)
 
     @property
     def side(self) -> int:
+        """n′, voxels along each side of a frame; the last may reach beyond the scene."""
         return -(-self.size // self.voxels.spatial_merge)
 
     def edges(self, frames: slice) -> NDArray[np.int64]:

@@ -33,17 +33,25 @@ coefficients: the product of fewer spends more time on the coefficients than on 
 class Sign(Protocol):
     """What `admm` needs of a split of the sign; see `SignSplit`."""
 
-    def advance(self, theta: Array) -> None: ...
+    def advance(self, theta: Array) -> None:
+        """Update split and multiplier by new coefficients θ (K, n′, n′)."""
 
-    def pull(self) -> Array: ...
+    def pull(self) -> Array:
+        """Return D·(v − multiplier), the coefficients towards which the split draws."""
+        ...
 
-    def rescale(self, factor: float) -> None: ...
+    def rescale(self, factor: float) -> None:
+        """Multiply the multiplier, which is held divided by ρ, by ``factor``, as another ρ requires."""
 
-    def rebase(self, grid: Array, shape: tuple[int, ...]) -> None: ...
+    def rebase(self, grid: Array, shape: tuple[int, ...]) -> None:
+        """Continue on another grid D of as many instants, for coefficients of another ``shape``."""
 
-    def resume(self, other: Any) -> None: ...
+    def resume(self, other: Any) -> None:
+        """Take over split and multiplier of another one, to continue from its solution."""
 
-    def copied(self) -> Sign: ...
+    def copied(self) -> Sign:
+        """Return one that advances independently."""
+        ...
 
 
 class SignSplit:

@@ -45,7 +45,9 @@ class Wiener:
             across, penalty = (xp.asarray(x, dtype=frames.dtype, device=frames.device) for x in made)
             self._made = across, penalty
         across, penalty = self._made
+        # Frames are square: rows and columns have the same cosines.
         spectrum = across @ frames @ across.T
+        # Without a weight, the way there and back would only round.
         return across.T @ (spectrum / (1 + weight * penalty)) @ across if weight else xp.asarray(frames)
 
 

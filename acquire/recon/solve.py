@@ -43,6 +43,7 @@ class TwistSolver(Solver):
     def solve(
         self, segment: Segment, problem: Problem, options: SolveOptions, clock: IterationClock
     ) -> Estimate:
+        """Solve with the paper's TwIST for a fixed weight of total variation, in all frames."""
         return solve_twist(Given(segment, problem, options, clock), banded=False)
 
 
@@ -52,6 +53,7 @@ class BandedTwistSolver(Solver):
     def solve(
         self, segment: Segment, problem: Problem, options: SolveOptions, clock: IterationClock
     ) -> Estimate:
+        """Solve with TwIST in the band that the lines support, for light that is not negative."""
         return solve_twist(Given(segment, problem, options, clock), banded=True)
 
 
@@ -116,11 +118,14 @@ class KnownImage:
         self._light = np.interp(np.arange(frames), np.flatnonzero(seen), light[seen]).astype(arrays.dtype)
 
     def predict(self) -> NDArray[Any]:
+        """Return the lines of the picture under its light s(t)."""
         return host(self._operator.forward(self._coefficients)) / self._problem.norm
 
     def video(self) -> NDArray[Any]:
+        """Return s(t) · picture (T, n′, n′)."""
         video: NDArray[Any] = self._light[:, None, None] * merge_video(self._image[None], self._merge, 1)
         return video
 
     def facts(self) -> dict[str, Any]:
+        """Return the number of coefficients of the light, the only unknowns."""
         return {"patterns": 1}

@@ -32,6 +32,7 @@ class Unseen:
     why: str
 
     def to_dict(self) -> dict[str, Any]:
+        """Return frames, arm and lines as JSON, as provenance of a video states them."""
         return asdict(self)
 
     def words(self, first_frame: int, last_frame: int) -> str:

@@ -116,6 +116,7 @@ class VolumeTv:
     def _prox_of_any(self, volume: Array, weight: float) -> Array:
         """As `kernels.volume_prox`, in operations of the array API standard."""
         xp, scales = namespace(volume), (1.0, 1.0, self.pace)
+        # Differences along an axis have a norm of at most 2: 4 + 4 + 4·μ² is the dual's Lipschitz constant.
         step, momentum = 1 / ((8 + 4 * self.pace**2) * weight), 1.0
         dual, leading = self._dual, self._dual
         for _ in range(self.iterations):
@@ -124,6 +125,7 @@ class VolumeTv:
             if self.cyclic:
                 gradient[-1] = self.pace * (xp.roll(x, -1, axis=0) - x)
             new = leading + step * xp.stack(gradient)
+            # Each voxel's three differences together stay in the unit ball, which makes the TV isotropic.
             new = new / xp.maximum(xp.sqrt(xp.sum(new**2, axis=0)), 1)
             following = (1 + math.sqrt(1 + 4 * momentum**2)) / 2
             leading = new + ((momentum - 1) / following) * (new - dual)

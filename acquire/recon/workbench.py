@@ -148,6 +148,7 @@ class Workbench:
 
     @property
     def record(self) -> list[dict[str, Any]]:
+        """What was tried, as JSON: prior, weight and held-out error of each candidate, in order."""
         return self._shared.record
 
     def with_problem(

@@ -58,22 +58,27 @@ class Here:
         self._watch, self._done, self._stopped = watch, 0.0, False
 
     def submit(self, task: Task) -> Future[Part]:
+        """Solve the task, and return its result as a future that is done."""
         future: Future[Part] = Future()
         future.set_result(solve(task, self))
         return future
 
     def share_done(self) -> float:
+        """Return the tasks done, with the share of the one in progress."""
         return self._done
 
     def stop(self) -> None:
+        """Make the task in progress, and all that follow, end with their best result."""
         self._stopped = True
 
     def advance(self, share: float) -> None:
+        """Count progress of the task, and ask whether to stop."""
         self._done += share
         if self._watch is not None and self._watch(self._done):
             self._stopped = True
 
     def is_set(self) -> bool:
+        """Return whether to stop, which the solver asks after every iteration."""
         return self._stopped
 
 
@@ -84,14 +89,17 @@ class Processes:
         self.workers, self._executor, self._shared = workers, executor, shared
 
     def submit(self, task: Task) -> Future[Part]:
+        """Hand the task to a process, which is started if there are fewer than ``workers``."""
         # A process may be started by this, which takes seconds.
         with _interrupts_blocked():
             return self._executor.submit(_solve_in_worker, task)
 
     def share_done(self) -> float:
+        """Return the tasks done, with those in progress in part, as their processes have reported."""
         return self._shared.done
 
     def stop(self) -> None:
+        """Make the tasks of all processes end after the iteration in progress."""
         self._shared.stop.set()
 
 
@@ -130,12 +138,14 @@ class Cluster:
         self._lock, self._done = threading.Lock(), 0
 
     def submit(self, task: Task) -> Future[Part]:
+        """Hand the task to the cluster, without its deadline, which another machine's clock cannot keep."""
         without_deadline = replace(task, due=None)  # the deadline is a time of this machine's clock
         future: Future[Part] = self._executor.submit(solve, without_deadline, _NoWatch())
         future.add_done_callback(self._count)
         return future
 
     def share_done(self) -> float:
+        """Return the number of whole tasks done: a cluster does not report their iterations."""
         return self._done
 
     def stop(self) -> None:

@@ -28,7 +28,9 @@ class Sheet(Protocol):
     shape: tuple[int, int]
 
     @property
-    def frames(self) -> int: ...
+    def frames(self) -> int:
+        """Frames written so far; of a mosaic, all of them."""
+        ...
 
     def take(
         self,

@@ -72,19 +72,23 @@ class Clock(Protocol):
         """ns since 1970-01-01T00:00:00 UTC."""
         ...
 
-    def sleep(self, duration_s: float) -> None: ...
+    def sleep(self, duration_s: float) -> None:
+        """Wait; a test's clock advances instead."""
 
 
 class HostClock:
     """CLOCK_MONOTONIC, which all processes of a host share, and the host's UTC."""
 
     def monotonic_ns(self) -> int:
+        """Return ns of CLOCK_MONOTONIC, from which processes compute the same pulses."""
         return time.monotonic_ns()
 
     def utc_ns(self) -> int:
+        """Return ns since 1970 by the host's clock, which may be set meanwhile."""
         return time.time_ns()
 
     def sleep(self, duration_s: float) -> None:
+        """Wait for ``duration_s`` seconds of this host."""
         time.sleep(duration_s)
 
 

@@ -39,14 +39,18 @@ if TYPE_CHECKING:
 class Sensor(Protocol):
     """Returns lines by their numbers."""
 
-    def read(self, first_line: int, count: int) -> Readout: ...
+    def read(self, first_line: int, count: int) -> Readout:
+        """Return ``count`` lines from ``first_line`` on, and which of them the camera loses."""
+        ...
 
 
 class Optics(Protocol):
     """The source of a simulated sensor's lines."""
 
     @property
-    def geometry(self) -> GeometryConfig: ...
+    def geometry(self) -> GeometryConfig:
+        """M and S, by which a pulse train's sub-steps are counted."""
+        ...
 
     def expose(self, train: PulseTrain, code: Code, config: CameraConfig) -> Sensor:
         """Return the camera's lines under a train's timing and the light's code."""
@@ -64,6 +68,7 @@ class SimulatedOptics:
 
     @property
     def pixels(self) -> int:
+        """Pixels of a line: the stages, or all columns of the sensor behind a fibre."""
         return self.geometry.stages if self.fibre is None else self.fibre.sensor_pixels
 
     def expose(self, train: PulseTrain, code: Code, config: CameraConfig) -> ArmSource:

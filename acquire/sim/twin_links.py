@@ -24,9 +24,12 @@ class Twin(Protocol):
         """True if `take` must be called again at once, because the twin's time passes only within it."""
         ...
 
-    def feed(self, data: bytes) -> None: ...
+    def feed(self, data: bytes) -> None:
+        """Take bytes that the host has sent."""
 
-    def take(self) -> bytes: ...
+    def take(self) -> bytes:
+        """Return the bytes for the host, as many as there are by now."""
+        ...
 
 
 class TwinTransport:

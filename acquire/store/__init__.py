@@ -11,6 +11,7 @@
     one array          array_writer → shard       stored_rows → chunks → array_files
     tables             table                      table_reader
     what is written    terms, spec (attributes), layout and shape (metadata), codecs (bytes)
+      by others        variant → plugin_codecs, zarr_codec
     where              files, pages, host, mount  source → disk | remote (URLs)
       all or nothing   delivery, refusals
 

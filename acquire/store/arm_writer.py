@@ -52,6 +52,7 @@ class ArmWriter:
 
     @property
     def next_line(self) -> int:
+        """The trigger's number of the line that the next block has to begin with."""
         return self._first_line + self.pixels.rows  # the last array to be appended to: see `append`
 
     @property
@@ -66,6 +67,7 @@ class ArmWriter:
 
     @property
     def bytes_written(self) -> int:
+        """Bytes of chunks and checksums of all arrays, without indices and metadata."""
         return sum(array.bytes_written for array in self._arrays.values())
 
     @property
@@ -74,6 +76,7 @@ class ArmWriter:
         return any(array.direct for array in self._arrays.values())
 
     def create(self) -> None:
+        """Create the arrays' directories, which appending never does: a removed one must be noticed."""
         for array in self._arrays.values():
             self._disk.make_directory(array.directory, parents=True)
 
@@ -101,6 +104,7 @@ class ArmWriter:
             array.append(column.of(block), behind)
 
     def pad(self) -> None:
+        """Write the last, incomplete chunk of every array, filled up with its padding."""
         for array in self._arrays.values():
             array.pad()
 
@@ -120,10 +124,12 @@ class ArmWriter:
                 array.publish()
 
     def sync(self) -> None:
+        """Force all chunks written since the last call to the medium."""
         for array in self._arrays.values():
             array.sync()
 
     def close(self) -> None:
+        """Close the files of all arrays, even if closing one fails. Idempotent."""
         with contextlib.ExitStack() as closing:  # one that fails does not keep the others open
             for array in self._arrays.values():
                 closing.callback(array.close)

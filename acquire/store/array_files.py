@@ -5,8 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from acquire.store.layout import line_columns, parse_line_array
-from acquire.store.pages import PAGE
-from acquire.store.shape import ABSENT, index_bytes, shard_key, unpack_index
+from acquire.store.shape import ABSENT, index_bytes, most_stored_bytes, shard_key, unpack_index
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -33,8 +32,7 @@ class ArrayFiles:
     @property
     def most_bytes(self) -> int:
         """Largest possible size of a chunk in its file, however badly it was packed."""
-        # blosc adds 16 bytes to what it cannot pack; twice the size leaves other programs' codecs some room.
-        return 2 * self.shape.chunk_bytes + PAGE
+        return most_stored_bytes(self.shape.chunk_bytes)
 
     @property
     def chunks(self) -> int:

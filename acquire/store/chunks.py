@@ -5,9 +5,9 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 from acquire.store.array_files import ArrayFiles
-from acquire.store.codecs import BLOSC_HEADER, check_size, decode, stored_size
+from acquire.store.codecs import BLOSC_HEADER, check_size, checked_size, decode, stored_size
 from acquire.store.refusals import shows_damage
-from acquire.store.shape import ABSENT, CRC_BYTES, crc32c, index_bytes
+from acquire.store.shape import ABSENT, CRC_BYTES, PluginCodec, crc32c, index_bytes
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -54,11 +54,11 @@ class ChunkReader(ArrayFiles):
     def chunk(self, number: int, place: tuple[int, int] | None = None) -> NDArray[Any]:
         """Return all rows of one chunk, with padding; ``place`` is its offset and size, if known.
 
-        Raises `AbsentChunkError`, `DamagedChunkError`, OSError.
+        Raises `AbsentChunkError`, `DamagedChunkError`, OSError, and UsageError if its codec is not installed.
         """
         payload = self.payload(number, *(place or self.entry(number)))
         try:
-            samples = decode(payload, self.shape.codec)
+            samples = decode(payload, self.shape.codec, self.shape.chunk_bytes)
         except (ValueError, RuntimeError) as error:
             raise DamagedChunkError(str(error)) from error
         return samples.view(self.shape.dtype).reshape(self.shape.chunk_shape)
@@ -82,17 +82,22 @@ class ChunkReader(ArrayFiles):
         return payload
 
     def size_at(self, number: int, offset: int) -> int:
-        """Return the size that a chunk at ``offset`` has by its own header; 0 if there cannot be one.
+        """Return the size that a chunk at ``offset`` has by its header or checksum; 0 if there is none.
 
         Raises OSError if that cannot be found out now.
         """
+        codec = self.shape.codec
+        # What a plug-in packs has no header that is known here, but a checksum at its end.
+        wanted = self.most_bytes if isinstance(codec, PluginCodec) else BLOSC_HEADER
         try:
-            header = self._source.read_range(self.file(number), offset, BLOSC_HEADER)
+            data = self._source.read_range(self.file(number), offset, wanted)
         except OSError as error:
             if not shows_damage(error):
                 raise
             return 0
-        return stored_size(header, self.shape.chunk_bytes, self.shape.codec)
+        if isinstance(codec, PluginCodec):
+            return checked_size(data)
+        return stored_size(data, self.shape.chunk_bytes, codec)
 
     def trouble(self, number: int) -> str | None:
         """Return what is wrong with a chunk, in words; None if it has the right length and checksum.

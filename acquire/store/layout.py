@@ -17,7 +17,7 @@ from operator import attrgetter
 from typing import TYPE_CHECKING, Any
 
 from acquire.flags import LineFlag
-from acquire.store.shape import ITEM_BYTES, ArrayShape, codec_of
+from acquire.store.shape import ITEM_BYTES, ArrayShape, PluginCodec, codec_of
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -149,10 +149,13 @@ SAME_IN_BOTH_ARMS = ("code_index", "code", "tick", "time")
 def column_shape(column: Column, spec: RecordingSpec) -> ArrayShape:
     """Return how ``column`` is chunked; a file of any array has the same rows.
 
-    Tags are few bytes, and predictable: their chunks are longer, and packed even if pixels are not.
+    Tags are few bytes, and predictable: their chunks are longer, and packed even if pixels are not. A codec
+    of another distribution packs pixels only: without it, all else of a recording can still be read.
     """
     pixels = column.name == "lines"
-    codec: Codec = spec.codec if pixels or spec.codec != "none" else "lz4"
+    codec: Codec = spec.codec
+    if not pixels and (codec == "none" or isinstance(codec, PluginCodec)):
+        codec = "lz4"
     joined = 1 if pixels else spec.tag_chunks
     return ArrayShape(
         data_type=column.dtype,
@@ -178,7 +181,8 @@ def line_array(column: Column, shape: ArrayShape, rows: int) -> Document:
         dimensions=("line", "pixel")[: len(shape.chunk_shape)],
         chunk_shape=shape.shard_shape,
         codecs=[{"name": "sharding_indexed", "configuration": sharding}],
-        attributes=column.attributes,
+        attributes=column.attributes
+        | ({"codec": shape.codec.origin} if isinstance(shape.codec, PluginCodec) else {}),
         fill=column.fill,
     )
 
@@ -195,7 +199,7 @@ def parse_line_array(document: Document) -> tuple[ArrayShape, int]:
         raise ValueError(f"shape {document['shape']} does not fit chunks {inner['chunk_shape']}")
     if inner["index_location"] != "start" or document["data_type"] not in ITEM_BYTES:
         raise ValueError(f"the index is at the {inner['index_location']}, of samples {document['data_type']}")
-    codec = codec_of(inner["codecs"])
+    codec = codec_of(inner["codecs"], document.get("attributes"))
     shape = ArrayShape(document["data_type"], tuple(row_shape), chunk_rows, shard_rows // chunk_rows, codec)
     if shape.chunk_bytes > MAX_READ_BYTES:
         raise ValueError(f"chunks of {inner['chunk_shape']} samples are too large")
@@ -261,6 +265,8 @@ def packing(shape: ArrayShape) -> list[Document]:
     """Return the Zarr codec that packs the bytes of a chunk, if any."""
     if shape.codec == "none":
         return []
+    if isinstance(shape.codec, PluginCodec):
+        return [{"name": shape.codec.zarr_name, "configuration": json.loads(shape.codec.configuration)}]
     blosc = {
         "cname": shape.codec,
         "clevel": 1,

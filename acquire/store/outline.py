@@ -18,6 +18,7 @@ from acquire.store.array_files import COLUMNS, ArmFiles, ArrayFiles
 from acquire.store.attributes import size_limit_bytes
 from acquire.store.files import DISK, is_locked
 from acquire.store.opening import opened
+from acquire.store.shape import PluginCodec
 from acquire.store.source import LocalSource, source_of
 from acquire.store.table_reader import read_events, read_gaps, salvage_events
 from acquire.text import counted
@@ -27,6 +28,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from acquire.store.layout import Document
+    from acquire.store.shape import Codec
     from acquire.store.source import Source
     from acquire.store.table_reader import Event, Gap
 
@@ -90,6 +92,11 @@ class Outline:
         if self.state == "sealed":
             return False
         return is_locked(self.source.path) if isinstance(self.source, LocalSource) else None
+
+    @property
+    def codec(self) -> Codec:
+        """The codec of the pixels, which need not be installed here if it is a plug-in's."""
+        return self.arms[ARMS[0]].files("lines").shape.codec
 
     @property
     def first_line(self) -> int:
@@ -257,6 +264,8 @@ class Outline:
             "line_rate_hz": NS_PER_S / period_ns,
             "start_ns": self._start_ns(),
             "dtype": self.arms["a"].data_type,
+            "codec": str(self.codec),
+            "codec_missing": self._codec_missing(),
             "bytes": self.source.total_bytes(),
             "max_bytes": size_limit_bytes(self.attrs),
             "segment": self.attrs.get("segment"),
@@ -279,6 +288,14 @@ class Outline:
             "versions": self.attrs["versions"],
             "plugins": self.attrs.get("plugins"),
         }
+
+    def _codec_missing(self) -> str | None:
+        """Return why the pixels cannot be unpacked here, and what to install; None if they can."""
+        if not isinstance(self.codec, PluginCodec):
+            return None
+        from acquire.store.plugin_codecs import missing_codec  # numpy, for which no list waits
+
+        return missing_codec(self.codec) or None
 
     def _code_facts(self) -> dict[str, Any]:
         """Return the code; of format 1, which calls the register's state ``seed``, by today's names."""

@@ -25,7 +25,9 @@ from acquire.store.camera_stream import CameraStream
 from acquire.store.opening import opened
 from acquire.store.outline import Outline
 from acquire.store.overview import read_overview
+from acquire.store.plugin_codecs import variant_of
 from acquire.store.present import present_values
+from acquire.store.shape import PluginCodec
 from acquire.store.source import source_of
 from acquire.text import counted
 
@@ -105,9 +107,14 @@ class Recording(Outline):
 
     @cached_property
     def group(self) -> zarr.Group:
-        """The recording as a zarr-python group; zarr is imported only here."""
+        """The recording as a zarr-python group; zarr is imported only here.
+
+        Raises UsageError if the codec of the pixels is not installed, without which zarr opens no part of it.
+        """
         import zarr
 
+        if isinstance(self.codec, PluginCodec):
+            variant_of(self.codec)
         return zarr.open_group(self.source.zarr_store(), mode="r", zarr_format=3)
 
     def end_ns(self) -> int | None:

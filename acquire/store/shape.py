@@ -6,6 +6,7 @@ Nothing here needs a library of arrays or codecs, which take half a second to lo
 
 from __future__ import annotations
 
+import json
 import math
 import struct
 from dataclasses import dataclass
@@ -14,14 +15,16 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from fastcrc import crc32
 
+from acquire.store.pages import PAGE
+
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Mapping, Sequence
 
     import numpy as np
     from typing_extensions import Buffer
 
-Codec = Literal["none", "lz4", "zstd"]
-CODECS: tuple[Codec, ...] = ("none", "lz4", "zstd")
+OwnCodec = Literal["none", "lz4", "zstd"]
+CODECS: tuple[OwnCodec, ...] = ("none", "lz4", "zstd")
 CRC_BYTES = 4
 
 ITEM_BYTES = {"uint8": 1, "uint16": 2, "uint64": 8, "int64": 8}
@@ -29,6 +32,37 @@ ITEM_BYTES = {"uint8": 1, "uint16": 2, "uint64": 8, "int64": 8}
 
 ABSENT = 2**64 - 1
 """Offset and size of a missing chunk."""
+
+
+@dataclass(frozen=True, slots=True)
+class PluginCodec:
+    """A codec of another distribution, as the metadata of an array state it; ``str()`` is its name.
+
+    It need not be installed here: `acquire.store.codecs` looks for it when a chunk is packed or unpacked.
+
+    Attributes
+    ----------
+    name : name of the plug-in, as a rig file has it
+    zarr_name, configuration : its name in Zarr, and its parameters there as JSON text
+    distribution, version : where the plug-in came from when the array was created
+    """
+
+    name: str
+    zarr_name: str
+    configuration: str
+    distribution: str
+    version: str
+
+    def __str__(self) -> str:
+        return self.name
+
+    @property
+    def origin(self) -> dict[str, str]:
+        """The attribute ``codec`` of an array, without which only its name in Zarr would be known."""
+        return {"name": self.name, "distribution": self.distribution, "version": self.version}
+
+
+Codec = OwnCodec | PluginCodec
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,6 +84,7 @@ class ArrayShape:
 
     @property
     def chunk_shape(self) -> tuple[int, ...]:
+        """(rows, …) of a chunk, the unit that is packed and has a checksum."""
         return (self.chunk_rows, *self.row_shape)
 
     @property
@@ -64,7 +99,14 @@ class ArrayShape:
 
     @property
     def shard_shape(self) -> tuple[int, ...]:
+        """(rows, …) of a file, the shape of a chunk in Zarr's own metadata."""
         return (self.shard_rows, *self.row_shape)
+
+
+def most_stored_bytes(chunk_bytes: int) -> int:
+    """Return the size, with checksum, that a chunk of ``chunk_bytes`` bytes may have in its file."""
+    # blosc adds 16 bytes to what it cannot pack; twice the size leaves other codecs some room.
+    return 2 * chunk_bytes + PAGE
 
 
 def shard_key(shard: int, dimensions: int) -> str:
@@ -77,10 +119,13 @@ def index_bytes(chunks: int) -> int:
     return 16 * chunks + CRC_BYTES
 
 
-def crc32c(data: Buffer) -> bytes:
-    """Return the checksum as Zarr stores it: 4 bytes, little-endian."""
+def crc32c(data: Buffer, before: bytes = bytes(CRC_BYTES)) -> bytes:
+    """Return the checksum as Zarr stores it: 4 bytes, little-endian.
+
+    ``before`` is that of bytes which precede ``data``, if it is to be the checksum of both.
+    """
     # Of the library that copies no buffer, releases the interpreter's lock, and loads within 2 ms.
-    return crc32.iscsi(data).to_bytes(CRC_BYTES, "little")
+    return crc32.iscsi(data, int.from_bytes(before, "little")).to_bytes(CRC_BYTES, "little")
 
 
 def pack_index(entries: Sequence[tuple[int, int]]) -> bytes:
@@ -97,8 +142,11 @@ def unpack_index(data: bytes, chunks: int) -> tuple[list[tuple[int, int]], bool]
     return list(struct.iter_unpack("<QQ", entries)), crc32c(entries) == checksum
 
 
-def codec_of(codecs: Sequence[dict[str, Any]]) -> Codec:
-    """Return the codec of a chain `bytes`, optionally `blosc`, `crc32c`. Raises ValueError for others."""
+def codec_of(codecs: Sequence[dict[str, Any]], attributes: Mapping[str, Any] | None = None) -> Codec:
+    """Return the codec of a chain `bytes`, optionally `blosc` or a plug-in's codec, `crc32c`.
+
+    ``attributes`` of the array name the plug-in. Raises ValueError for other chains.
+    """
     names = [codec["name"] for codec in codecs]
     if names == ["bytes", "crc32c"]:
         return "none"
@@ -107,4 +155,9 @@ def codec_of(codecs: Sequence[dict[str, Any]]) -> Codec:
         for codec in CODECS:
             if codec == codecs[1]["configuration"]["cname"]:
                 return codec
+    origin = (attributes or {}).get("codec")
+    if origin is not None and len(names) == 3 and names[::2] == ["bytes", "crc32c"]:
+        name, distribution, version = (str(origin[key]) for key in ("name", "distribution", "version"))
+        configuration = json.dumps(codecs[1].get("configuration", {}), sort_keys=True)
+        return PluginCodec(name, str(names[1]), configuration, distribution, version)
     raise ValueError(f"the codecs {', '.join(names)} are not known")

@@ -59,9 +59,11 @@ class LocalSource:
         return self._root
 
     def read(self, key: str) -> bytes:
+        """Return all bytes of a file. Raises OddFileError for a pipe or a device in its place."""
         return read_regular(f"{self._root}/{key}")
 
     def read_range(self, key: str, start: int, size: int) -> bytes:
+        """Return a part of a file, which is opened for it: a recording has more files than descriptors."""
         fd = open_regular(f"{self._root}/{key}")
         try:
             return os.pread(fd, size, start)
@@ -69,6 +71,7 @@ class LocalSource:
             os.close(fd)
 
     def expect(self, key: str, start: int, size: int) -> None:
+        """Advise the kernel to read the bytes ahead."""
         fd = open_regular(f"{self._root}/{key}")
         try:
             os.posix_fadvise(fd, start, size, os.POSIX_FADV_WILLNEED)
@@ -76,24 +79,30 @@ class LocalSource:
             os.close(fd)
 
     def size(self, key: str) -> int:
+        """Return the size of a file. Raises FileNotFoundError."""
         return os.stat(f"{self._root}/{key}").st_size  # noqa: PTH116 - for every file of a list of recordings
 
     def names(self, key: str) -> list[str]:
+        """Return the names below ``key``, in no particular order."""
         try:
             return os.listdir(f"{self._root}/{key}")  # noqa: PTH208 - names only, without a Path for each
         except (FileNotFoundError, NotADirectoryError):
             return []
 
     def exists(self) -> bool:
+        """Return whether the directory, or anything else, is there."""
         return self.path.exists()
 
     def total_bytes(self) -> int:
+        """Return the bytes of all files."""
         return tree_bytes(self.path)
 
     def beside(self, name: str) -> LocalSource:
+        """Return the directory of that name next to this one."""
         return LocalSource(self.path.with_name(name))
 
     def zarr_store(self) -> Path | Any:
+        """Return the path, which zarr-python opens itself."""
         return self.path
 
 

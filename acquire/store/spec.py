@@ -19,7 +19,7 @@ from acquire.lines import ARMS
 from acquire.store.array_writer import ENCODED_AHEAD
 from acquire.store.host import this_host
 from acquire.store.layout import FORMAT
-from acquire.store.shape import CODECS, Codec
+from acquire.store.shape import CODECS, Codec, PluginCodec
 from acquire.store.shard import MAX_CHUNK_BYTES, MAX_SHARD_CHUNKS
 
 if TYPE_CHECKING:
@@ -82,7 +82,7 @@ class RecordingSpec:
     extra : further attributes (``scene``, ``effects``, ``simulated`` ...)
     chunk_lines, shard_chunks : lines per chunk; chunks per file
     tag_chunks : chunks of pixels whose tags (code, times, flags) share one chunk; divides ``shard_chunks``
-    codec : codec of the pixels
+    codec : codec of the pixels, ours or a plug-in's (`acquire.store.codecs.configured_codec`)
     encoders : threads that pack chunks, if there is a codec
     fsync : force bytes to the medium at every ``"commit"``, or only at the ``"seal"``
     commit_lines : lines on disk that may wait for their commit; a whole number of chunks is best
@@ -152,7 +152,7 @@ class RecordingSpec:
             "layout": ("dual", "compact", "emulated", "interline", "fibre"),
         }
         for name, allowed in choices.items():
-            if getattr(self, name) not in allowed:
+            if getattr(self, name) not in allowed and not isinstance(getattr(self, name), PluginCodec):
                 raise UsageError(
                     f"a recording cannot have {name} = {getattr(self, name)!r}", possible=", ".join(allowed)
                 )

@@ -14,6 +14,7 @@ from acquire.reading import parse_object
 from acquire.store import overview
 from acquire.store.layout import DAMAGE
 from acquire.store.links import refuse_links
+from acquire.store.plugin_codecs import missing_codec
 from acquire.store.reader import open_source
 from acquire.store.refusals import refused
 from acquire.store.scan import chunks_of, missing_rows, scan
@@ -210,6 +211,8 @@ def _metadata(recording: Recording) -> Iterator[str]:
 
 
 def _notes(recording: Recording) -> Iterator[str]:
+    if missing := missing_codec(recording.codec):
+        yield f"chunks of pixels were verified by their checksums alone, and not unpacked: {missing}"
     with contextlib.suppress(DataError):  # unreadable events are reported by `_contradictions`
         yield from map(str, suspect_lines(recording))
     for lost in recording.tables_lost.values():

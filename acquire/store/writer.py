@@ -29,6 +29,7 @@ from acquire.store.files import DISK, SCRATCH, Publisher, check_new_path, lock
 from acquire.store.mount import mount_above
 from acquire.store.overview import PassingOverview, withdraw_overview, write_overview
 from acquire.store.pages import keep_freed_memory
+from acquire.store.plugin_codecs import EncodingError
 from acquire.store.rebuild import write_copy
 from acquire.store.refusals import CURES, refusal
 from acquire.store.removal import RESERVE, Unborn, remove
@@ -55,6 +56,7 @@ RESERVE_BYTES = 2**21
 """Bytes kept free for the metadata of the end: more than tables (`table.TEXT_BYTES`) and root take."""
 USUAL_ROOT_BYTES = 2**17
 """Bytes of them for the root; for a larger one, more are reserved."""
+_DISK_HINT = "check that the directory still exists and the kernel's log for errors of the disk"
 
 
 class RecordingWriter:
@@ -472,8 +474,9 @@ class RecordingWriter:
         except OSError as error:
             what = f"{doing}: {error.strerror or error}"
             self._failure = self._failure or what  # the first: others follow from it
-            hint = "check that the directory still exists and the kernel's log for errors of the disk"
-            hint = CURES.get(error.errno or 0, hint)
+            failed, hint = "disk", CURES.get(error.errno or 0, _DISK_HINT)
+            if isinstance(error, EncodingError):
+                failed, hint = "codec", "another recording.codec: lz4 and zstd are ours"
             raise kind(
-                f"{self.path}: the disk failed while {what}", possible=self._safe(), hint=hint
+                f"{self.path}: the {failed} failed while {what}", possible=self._safe(), hint=hint
             ) from error

@@ -74,6 +74,7 @@ class ExternalCounts:
         if self._trigger is None or not self._trigger["turned_ns"]:
             return 0.0
         still_s = now_s - self._trigger["turned_ns"] / NS_PER_S
+        # One that is held up will catch up; one that is stuck is a fault of the trigger, reported elsewhere.
         is_held_up = HELD_UP_S < still_s < _LONGEST_HOLD_UP_S
         return now_s if is_held_up else self._trigger["held_up_to_ns"] / NS_PER_S
 

@@ -91,6 +91,7 @@ def account(counted: Counted, *, closed: bool) -> ArmLedger:
             pending=pending,
             balanced=balanced,
         )
+    # The counters are read one after the other, and a block may pass from one to the next meanwhile.
     balanced = -counted.block <= waiting <= counted.room + counted.block
     return ArmLedger(
         issued=issued,

@@ -51,6 +51,7 @@ class Loss:
 
     @property
     def end_line(self) -> int:
+        """The first line after the lost ones."""
         return self.first_line + self.count
 
 

@@ -112,6 +112,7 @@ class RingShape:
 
     @property
     def size(self) -> int:
+        """Bytes of shared memory: the header, and the slots behind it."""
         return self.pixels_offset + self.slots * self.slot_stride
 
 

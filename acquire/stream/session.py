@@ -61,23 +61,54 @@ class Writer(Protocol):
     """The part of `acquire.store.RecordingWriter` that a session needs."""
 
     @property
-    def committed_lines(self) -> int: ...
+    def committed_lines(self) -> int:
+        """Lines of each arm that a reader finds, whatever happens to this process."""
+        ...
+
     @property
-    def nearly_full(self) -> str | None: ...
+    def nearly_full(self) -> str | None:
+        """Why the recording should end before the disk is full, in words; None if it need not."""
+        ...
+
     @property
-    def beyond_bytes(self) -> int: ...
+    def beyond_bytes(self) -> int:
+        """Bytes by which lines that are held exceed the limit of retention."""
+        ...
+
     @property
-    def events_not_listed(self) -> int: ...
+    def events_not_listed(self) -> int:
+        """Number of events that found no room in their table."""
+        ...
+
     @property
-    def packs(self) -> bool: ...
-    def append(self, block: TaggedBlock, *, lent: bool = False) -> None: ...
-    def give_back(self, arm: str) -> None: ...
-    def add_gap(self, arm: str, first_line: int, count: int, cause: str) -> None: ...
-    def add_event(self, kind: str, tick: int, line: int, text: str = "") -> None: ...
-    def commit(self) -> None: ...
-    def rescue(self) -> int: ...
-    def seal(self, condition: RunCondition, end_reason: str, ledger: dict[str, Any]) -> None: ...
-    def close(self) -> None: ...
+    def packs(self) -> bool:
+        """Whether lines are packed, in other threads: lent lines need not be copied."""
+        ...
+
+    def append(self, block: TaggedBlock, *, lent: bool = False) -> None:
+        """Take the next lines of an arm; ``lent`` memory must stay as it is until `give_back`."""
+
+    def give_back(self, arm: str) -> None:
+        """Wait until the memory that was lent with the arm's last block may be reused."""
+
+    def add_gap(self, arm: str, first_line: int, count: int, cause: str) -> None:
+        """List ``count`` lines as lost, for the table of gaps of the next commit."""
+
+    def add_event(self, kind: str, tick: int, line: int, text: str = "") -> None:
+        """List an event at a line, and at the trigger's ``tick``, for the table of the next commit."""
+
+    def commit(self) -> None:
+        """Make all whole chunks of both arms visible to readers."""
+
+    def rescue(self) -> int:
+        """Return the rows that `seal` will keep, which after an error of the disk are those on it."""
+        ...
+
+    def seal(self, condition: RunCondition, end_reason: str, ledger: dict[str, Any]) -> None:
+        """End the recording for good, with its condition and the ledger's account of every line."""
+
+    def close(self) -> None:
+        """Close all files; lines that are not committed are dropped. Idempotent."""
 
 
 @dataclass(slots=True)

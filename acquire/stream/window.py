@@ -113,6 +113,7 @@ def span(window: Window, lines: int | None, held: Held, line_rate_hz: float) -> 
     first = wanted if window.padded else max(wanted, held.from_line)
     ends = [first + lines] if lines is not None else []
     ends += [held.at + window.post_lines] if window.post_lines is not None else []
+    # At least one line, even if the whole window has passed out of the rings.
     return Span(first, max(min(ends), first + 1) if ends else None, held.at)
 
 
@@ -125,6 +126,7 @@ def _whole_from(window: Window, rings: Mapping[str, Ring], first: Mapping[str, R
     for name, ring in rings.items():
         block = first[name]
         lost = 0 if block is None else sum(loss.count for loss in block.losses)
+        # Lines that the oldest block reports as lost need not be in the ring: they are known to be missing.
         lines.append(ring.newest_line if block is None else block.first_line - lost)
         if not window.padded:  # a padded window records lines that found their ring full as missing
             lines.append(ring.dropped_end)

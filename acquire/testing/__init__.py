@@ -1,17 +1,19 @@
-"""Contract suites: tests that every effect, scene, solver, denoiser and driver must pass, for plug-ins, too.
+"""Contract suites: tests that every effect, scene, codec, solver, denoiser and driver must pass.
 
 ::
 
     cameras     CameraContract      a camera driver, and the lines that it delivers
     triggers    TriggerContract     a sync trigger
+    codecs      CodecContract       a codec of recorded lines
     effects     EffectContract      an effect on a small bench
     scenes      SceneContract       a scene whose light is requested in several ways
     solvers     SolverContract      a solver on noisy lines of a known scene
                 DenoiserContract    a denoiser of frames
     adjoints    assert_adjoint      an operator and its transpose
 
-A suite is a class: extend it in your own test module and provide the fixture that its docstring names; pytest
-collects the tests. The built-in classes are tested with the same suites. Only this package needs pytest.
+A suite is a class: extend it in your own test module, for a plug-in of yours, and provide the fixture that
+its docstring names; pytest collects the tests. The built-in classes are tested with the same suites. Only
+this package needs pytest.
 """
 
 from typing import TYPE_CHECKING
@@ -23,6 +25,7 @@ from acquire.lazy import lazily
 if TYPE_CHECKING:
     from acquire.testing.adjoints import assert_adjoint
     from acquire.testing.cameras import CameraContract, CameraStand
+    from acquire.testing.codecs import CodecContract
     from acquire.testing.effects import EffectContract
     from acquire.testing.scenes import SceneContract
     from acquire.testing.solvers import DenoiserContract, SolverContract
@@ -31,6 +34,7 @@ if TYPE_CHECKING:
 _HOMES = {
     "CameraContract": "cameras",
     "CameraStand": "cameras",
+    "CodecContract": "codecs",
     "DenoiserContract": "solvers",
     "EffectContract": "effects",
     "SceneContract": "scenes",
@@ -45,6 +49,7 @@ pytest.register_assert_rewrite(*sorted({f"{__name__}.{home}" for home in _HOMES.
 __all__ = [
     "CameraContract",
     "CameraStand",
+    "CodecContract",
     "DenoiserContract",
     "EffectContract",
     "SceneContract",

@@ -60,6 +60,7 @@ class CameraContract:
         stand.stop()
 
     def test_it_says_who_it_is_and_how_it_is_set(self, stand: CameraStand, camera: Camera) -> None:
+        """A recording states both; without the serial number, arms could be exchanged unnoticed."""
         identity, settings = camera.identify(), camera.settings()
         assert identity.model
         assert stand.serial in identity.serial
@@ -67,12 +68,14 @@ class CameraContract:
         assert settings["PixelFormat"].startswith("Mono")
 
     def test_a_camera_that_is_not_armed_gives_no_lines(self, camera: Camera) -> None:
+        """A wait that could only time out is an error of the caller."""
         with pytest.raises(CameraError, match="not armed"):
             camera.next_block(0.1)
 
     def test_without_a_trigger_the_wait_is_bounded_and_in_vain(
         self, stand: CameraStand, camera: Camera
     ) -> None:
+        """A grabber looks after its process between waits: an endless one could not be stopped."""
         camera.arm()
         if stand.lines is not None:
             # Not for a camera whose lines are unknown: it may run freely, without triggers.
@@ -84,6 +87,7 @@ class CameraContract:
     def test_lines_count_from_arm_without_a_hole_and_are_what_the_sensor_saw(
         self, stand: CameraStand, camera: Camera
     ) -> None:
+        """Lines of both arms are matched by their numbers, so that a hole that is not told shifts one arm."""
         camera.arm()
         stand.start()
         blocks = take(camera, 12)
@@ -101,6 +105,7 @@ class CameraContract:
     def test_every_arming_counts_anew_and_ending_twice_is_ending_once(
         self, stand: CameraStand, camera: Camera
     ) -> None:
+        """After a fault nobody knows what has been ended already, so that everything is ended again."""
         for _ in range(2):
             camera.arm()
             stand.start()

@@ -45,12 +45,14 @@ class EffectContract:
     """Needs a fixture ``effect``: an installed effect whose parameters are large enough to change lines."""
 
     def test_a_scene_file_finds_it_and_a_recording_gives_it_again(self, effect: Effect) -> None:
+        """A recording's attributes give the same effect, and so do arguments sent to other processes."""
         assert EFFECTS.load(effect.kind) is type(effect)
         scene = small_bench((effect,)).scene
         assert SceneFile.model_validate(scene.model_dump(mode="json")).root.effects == (effect,)
         assert pickle.loads(pickle.dumps(effect)) == effect  # noqa: S301  # our own bytes
 
     def test_it_changes_lines_and_its_stages_say_whose_they_are(self, effect: Effect) -> None:
+        """An effect that changes nothing was not applied. Errors and times are reported by its name."""
         # An effect may act on one arm only, as a misregistration does.
         changed = False
         for arm in "ab":
@@ -63,6 +65,7 @@ class EffectContract:
         assert effect.place in PLACES
 
     def test_lines_do_not_depend_on_how_they_are_read(self, effect: Effect) -> None:
+        """Cameras deliver blocks of any size, and several processes compute them."""
         bench, again = small_bench((effect,)), small_bench((effect,)).camera("a", CODE)
         whole = bench.camera("a", CODE).read(-300, 900)
         parts, line = [], -300
@@ -77,6 +80,7 @@ class EffectContract:
         np.testing.assert_array_equal(later.pixels, whole.pixels[500:800])
 
     def test_its_draws_are_its_own(self, effect: Effect) -> None:
+        """Adding an effect must not change the draws of others, nor a test's own."""
         # An effect that drew from the stream of numpy's old functions would depend on all others that do.
         before = np.random.get_state()[1].tolist()  # type: ignore[index]  # noqa: NPY002
         first = small_bench((effect,)).camera("a", CODE).read(0, 512)

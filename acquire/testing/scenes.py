@@ -27,11 +27,13 @@ class SceneContract:
         return scene.build(SIZE, SUBSTEP_S)
 
     def test_a_scene_file_finds_it_and_another_process_is_given_the_same(self, scene: SceneModel) -> None:
+        """Each camera computes the scene in a process of its own."""
         assert SCENES.load(scene.kind) is type(scene)
         assert SceneFile.model_validate(scene.model_dump(mode="json")).root == scene
         assert pickle.loads(pickle.dumps(scene)) == scene  # noqa: S301  # our own bytes
 
     def test_it_shows_finite_light_of_the_size_that_was_asked(self, scene: SceneModel) -> None:
+        """Negative or endless light would reach the lines as plausible numbers."""
         shown = self.shown(scene)
         light = shown.frames(FIRST, COUNT)
         assert light.shape == (COUNT, shown.size, shown.size)
@@ -42,6 +44,7 @@ class SceneContract:
         assert shown.frames(3, 0).shape == (0, shown.size, shown.size), "a request for 0 sub-steps is valid"
 
     def test_frames_do_not_depend_on_how_they_are_asked(self, scene: SceneModel) -> None:
+        """Both cameras ask for frames in an order of their own, and have to see the same."""
         shown, again = self.shown(scene), self.shown(scene)
         whole = shown.frames(FIRST, COUNT)
         # The later part first, so that nothing may be carried over from the earlier one.

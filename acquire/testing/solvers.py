@@ -79,6 +79,7 @@ class SolverContract:
         )
 
     def test_it_finds_what_blinks_in_noisy_lines(self) -> None:
+        """The scene blinks within a line, so that a picture per line cannot explain it."""
         segment, truth = blinking_segment()
         result = self.solve(segment)
         assert result.video.shape == truth.shape
@@ -91,6 +92,7 @@ class SolverContract:
         assert result.quality.misfit < 0.2, f"its lines have a misfit of {result.quality.misfit:.0%}"
 
     def test_masked_samples_have_no_influence_and_twice_the_light_is_twice_the_video(self) -> None:
+        """Masked samples hold anything, and units are not part of a scene."""
         segment, _ = blinking_segment()
         mask = segment.mask.copy()
         # Lost lines, and a defective column.
@@ -105,6 +107,7 @@ class SolverContract:
         np.testing.assert_allclose(bright.video, 2 * clean.video, atol=0.02 * scale)
 
     def test_a_stop_ends_it_with_the_best_so_far_and_every_iteration_is_reported(self) -> None:
+        """Ctrl-C and budgets rely on it."""
         segment, _ = blinking_segment()
         stop, reported = threading.Event(), []
 
@@ -127,6 +130,7 @@ class DenoiserContract(ABC):
         """Return the denoiser under test."""
 
     def test_no_strength_changes_nothing_and_more_leaves_less_noise(self) -> None:
+        """A solver chooses the strength by held-out samples, from 0 on."""
         draws = np.random.default_rng(2)
         flat = np.ones((3, 16, 12), np.float32)
         noisy = flat + 0.1 * draws.standard_normal(flat.shape).astype(np.float32)
@@ -140,6 +144,7 @@ class DenoiserContract(ABC):
         np.testing.assert_array_equal(noisy, kept, "it wrote into its input frames")
 
     def test_one_strength_per_frame_is_possible(self) -> None:
+        """Frames are coefficients, whose noise differs from one to the next."""
         frames = np.random.default_rng(3).standard_normal((2, 8, 8)).astype(np.float32)
         weights = np.array([0.0, 0.3], np.float32)
         mixed = self.make().prox(frames, weights)

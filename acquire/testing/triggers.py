@@ -35,11 +35,13 @@ class TriggerContract:
         return TriggerRun(run_id, **(settings | changes))
 
     def test_it_says_who_it_is(self, trigger: Trigger) -> None:
+        """Recordings state the trigger, and times are computed from its clock's rate."""
         identity = trigger.identify()
         assert identity.model
         assert identity.clock_hz > 0
 
     def test_a_run_is_tagged_without_a_gap_and_knows_its_lines(self, trigger: Trigger) -> None:
+        """Code and time of every line are derived from the tags: each has to be there, and right."""
         run = self.run()
         trigger.prepare(run)
         before_ns = time.time_ns()
@@ -60,6 +62,7 @@ class TriggerContract:
         assert statistics["tags"] >= len(tags)
 
     def test_a_second_run_starts_from_zero(self, trigger: Trigger) -> None:
+        """A line number that went on would be that of another code bit."""
         for name in ("first", "second"):
             trigger.prepare(self.run(name))
             trigger.start()
@@ -67,6 +70,7 @@ class TriggerContract:
             trigger.stop()
 
     def test_preparing_a_run_again_changes_nothing_and_another_is_refused(self, trigger: Trigger) -> None:
+        """A daemon repeats a request whose answer was lost; a running code must not change."""
         for _ in range(2):
             trigger.prepare(self.run())
         trigger.start()
@@ -77,10 +81,12 @@ class TriggerContract:
         trigger.stop()
 
     def test_stop_before_start_leaves_no_line(self, trigger: Trigger) -> None:
+        """Arming that fails half-way is undone by a stop."""
         trigger.prepare(self.run())
         assert trigger.stop() == 0
 
     def test_what_cannot_be_is_refused_in_words_before_a_pulse(self, trigger: Trigger) -> None:
+        """The operator sees the error as it is raised, and the light has to stay off."""
         with pytest.raises(TriggerError) as refused:
             trigger.prepare(self.run(substep_ticks=0))
         assert refused.value.possible or refused.value.hint, (
@@ -88,6 +94,7 @@ class TriggerContract:
         )
 
     def test_stop_ends_a_wait_for_tags(self, trigger: Trigger) -> None:
+        """Another thread waits for tags, and must not outlive its run."""
         trigger.prepare(self.run(tag_every_lines=60_000))
         trigger.start()
         # The first tag, after which 60 000 lines bring none: only the stop can end the wait.
@@ -105,6 +112,7 @@ class TriggerContract:
         assert waited, "a wait for tags must end with its run"
 
     def test_closing_twice_is_closing_once(self, trigger: Trigger) -> None:
+        """Whoever closes after an error does not know what is closed already."""
         # Drivers may open their link only now; before, there would be nothing to close.
         trigger.identify()
         trigger.close()

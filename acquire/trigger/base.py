@@ -100,7 +100,9 @@ class TagEvent:
 class Trigger(Protocol):
     """One sync trigger. Calls are bounded in time and raise TriggerError."""
 
-    def identify(self) -> TriggerIdentity: ...
+    def identify(self) -> TriggerIdentity:
+        """Return model, serial number, firmware and clock rate, as the trigger states them."""
+        ...
 
     def prepare(self, run: TriggerRun) -> None:
         """Load code and timing; raise TriggerError if they are not supported. The light stays off."""

@@ -42,25 +42,69 @@ MOST_NEWS = 500
 log = logging.getLogger("acquire.web")
 
 
+class Listeners:
+    """The streams of one event loop that wait for something new. None is told what: each looks for itself."""
+
+    def __init__(self) -> None:
+        self._loop = asyncio.get_running_loop()
+        self._waiting: set[asyncio.Event] = set()
+
+    def listen(self) -> asyncio.Event:
+        """Return an event that is set whenever there is something new, until `forget`."""
+        event = asyncio.Event()
+        self._waiting.add(event)
+        return event
+
+    def forget(self, event: asyncio.Event) -> None:
+        """Do not set the event any more, as its stream has ended."""
+        self._waiting.discard(event)
+
+    def wake(self) -> None:
+        """Set all events; to be called in the loop."""
+        for event in self._waiting:
+            event.set()
+
+    def wake_from_thread(self) -> None:
+        """Set all events soon; to be called in any thread."""
+        if not self._loop.is_closed():  # the live thread may outlive the loop for a moment
+            self._loop.call_soon_threadsafe(self.wake)
+
+
+class KeptNews:
+    """The latest `MOST_NEWS` messages about news, numbered from 0 on, for pages that are opened later."""
+
+    def __init__(self) -> None:
+        self._kept: deque[tuple[int, bytes]] = deque(maxlen=MOST_NEWS)
+        self._count = 0
+
+    def add(self, news: News) -> None:
+        """Keep another one, and drop the oldest if there are too many."""
+        self._kept.append((self._count, json_message("news", news.model_dump_json())))
+        self._count += 1
+
+    def after(self, number: int) -> tuple[int, list[bytes]]:
+        """Return the next number, and the messages from ``number`` on that are still kept."""
+        if number >= self._count:  # usually: pages ask twenty times a second, and hundreds of news are kept
+            return self._count, []
+        return self._count, [news for k, news in self._kept if k >= number]
+
+
 class Hub:
     """Belongs to one event loop, in which `run` must run."""
 
     def __init__(self, socket: Path, make_live: Callable[[Callable[[], None]], Live]) -> None:
         self.client = AsyncClient(socket)
-        self._loop = asyncio.get_running_loop()
-        self.live = make_live(self._wake_from_thread)
-        self.glimpser = Glimpser(socket, self._wake)
+        self.listeners, self.news = Listeners(), KeptNews()
+        self.live = make_live(self.listeners.wake_from_thread)
+        self.glimpser = Glimpser(socket, self.listeners.wake)
         self.status: Status | None = None
         self.setup: Setup | None = None
         self.connected = False
         self.why = "the daemon has not answered yet"
         self._heard_s = time.monotonic()
         self._armed_s = self._status_s = time.monotonic()
-        self._news: deque[tuple[int, bytes]] = deque(maxlen=MOST_NEWS)
-        self._count = 0
         self._version = 0
         self._run_id: str | None = None
-        self._waiting: set[asyncio.Event] = set()
         self._made: tuple[int, float, bytes] = -1, 0.0, b""
         """The latest state message, with its version and when it was made."""
 
@@ -114,21 +158,6 @@ class Hub:
             raise NoDaemonError(self.why, hint="acquire serve")
         return health_of(self.status, self.setup.line_rate_hz, time.monotonic() - self._armed_s)
 
-    def news_after(self, number: int) -> tuple[int, list[bytes]]:
-        """Return the next number, and the messages from ``number`` on that are still kept."""
-        if number >= self._count:  # usually: pages ask twenty times a second, and hundreds of news are kept
-            return self._count, []
-        return self._count, [news for k, news in self._news if k >= number]
-
-    def listen(self) -> asyncio.Event:
-        """Return an event that is set whenever there is something new, until `forget`."""
-        event = asyncio.Event()
-        self._waiting.add(event)
-        return event
-
-    def forget(self, event: asyncio.Event) -> None:
-        self._waiting.discard(event)
-
     # ---- the daemon
 
     async def _follow(self, reader: EventReader) -> None:
@@ -138,8 +167,7 @@ class Hub:
             # Any message counts, not only a status: see `_watch`.
             self._heard_s = time.monotonic()
             if isinstance(item, News):
-                self._news.append((self._count, json_message("news", item.model_dump_json())))
-                self._count += 1
+                self.news.add(item)
             elif item is not None:
                 if not self.connected:
                     log.info("connected to the daemon (process %d)", item.pid)
@@ -150,7 +178,7 @@ class Hub:
                     self._run_id = item.run_id
                     self._armed_s = time.monotonic()
                     self.live.show(None if item.run_id is None else await self.client.rings(), self.setup)
-            self._wake()
+            self.listeners.wake()
 
     async def _watch(self) -> None:
         """Detect a daemon that hangs: it sends nothing, but its connection stays open."""
@@ -171,15 +199,7 @@ class Hub:
         self.why = error.message if isinstance(error, AcquireError) else str(error)
         self._version += 1
         self.live.show(None, None)
-        self._wake()
-
-    def _wake(self) -> None:
-        for event in self._waiting:
-            event.set()
-
-    def _wake_from_thread(self) -> None:
-        if not self._loop.is_closed():  # the live thread may outlive the loop for a moment
-            self._loop.call_soon_threadsafe(self._wake)
+        self.listeners.wake()
 
     @property
     def is_recording(self) -> bool:

@@ -47,7 +47,7 @@ class OpenPages:
     async def _stream(self, place: StreamPlace, *, pictures: bool, glimpses: bool) -> AsyncIterator[bytes]:
         hub = self._hub
         # Not in `open`: a stream that is never begun would never reach `finally`.
-        woken = hub.listen()
+        woken = hub.listeners.listen()
         next_row = hub.live.watch() if pictures else 0
         # News start with the oldest that is kept: a page that is opened later shows earlier events, too.
         next_news, version, state_s, glimpse = 0, -1, 0.0, hub.glimpser.number
@@ -58,7 +58,7 @@ class OpenPages:
                 # Cleared before reading, so that news that come meanwhile wake the page again.
                 woken.clear()
                 parts: list[bytes] = []
-                next_news, news = hub.news_after(next_news)
+                next_news, news = hub.news.after(next_news)
                 now_s = time.monotonic()
                 if hub.version != version or news or now_s - state_s >= STATE_S:
                     version, state_s = hub.version, now_s
@@ -77,7 +77,7 @@ class OpenPages:
                 await wait(woken, STATE_S - LEAST_S)
         finally:
             place.give_back()
-            hub.forget(woken)
+            hub.listeners.forget(woken)
             if pictures:
                 hub.live.leave()
             if glimpses:

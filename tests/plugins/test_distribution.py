@@ -16,7 +16,7 @@ import pytest
 from packed import install
 
 from acquire.config import load_recorded
-from acquire.errors import ConfigError
+from acquire.errors import ConfigError, UsageError
 from acquire.store import open_recording
 
 HERE = Path(__file__).parent
@@ -96,15 +96,25 @@ def test_what_is_there_is_listed_with_whose_it_is_and_what_is_broken_with_its_er
         ("scene", "stars"),
         ("camera driver", "ramp"),
         ("trigger driver", "slow-link"),
+        ("codec", "differences"),
         ("solver", "least-squares"),
         ("denoiser", "local-wiener"),
     }
     assert all(row["works"] and row["version"] == "0.3" and row["about"] for row in theirs.values())
     broken = {row["name"]: row["error"] for row in rows if not row["works"]}
-    assert set(broken) == {"haze", "haze-free", "nowhere", "no-prox", "needs-argument"}
-    for name in ("haze", "haze-free"):
+    assert set(broken) == {
+        "haze",
+        "haze-free",
+        "haze-lines",
+        "unnamed",
+        "nowhere",
+        "no-prox",
+        "needs-argument",
+    }
+    for name in ("haze", "haze-free", "haze-lines"):
         assert "No module named 'library_that_nobody_installed'" in broken[name]
     assert broken["nowhere"].startswith("lab_careless:Nowhere needs place: one of light, image,")
+    assert broken["unnamed"] == "lab_careless:Unnamed needs zarr_name, its name in the metadata of arrays"
     assert broken["no-prox"] == "lab_careless:NoProx is not a class with a method prox(frames, weight)"
     assert "cannot be made without arguments: missing a required" in broken["needs-argument"]
     assert sum(row["distribution"] == "tdi-acquire" for row in rows) >= 45
@@ -181,6 +191,51 @@ def test_its_scene_with_its_effect_is_simulated_and_solved_by_its_solver(
         load_recorded(recording.attrs, str(recording))
 
 
+def test_its_codec_packs_a_recording_that_is_read_where_it_is_installed(acquire: Run, tmp_path: Path) -> None:
+    codec = '[recording]\ncodec = "differences"\ncodec_options = { level = 3 }\n'
+    (tmp_path / "packed.toml").write_text(RIG.format(driver="") + codec)
+    words = ("stars.toml", "--lines", "200", "--config")
+    for rig, name in (("rig.toml", "plain.zarr"), ("packed.toml", "run.zarr")):
+        made = acquire("simulate", *words, rig, "--out", name)
+        assert made.returncode == 0, made.stderr
+    read = "import sys, zarr; print(zarr.open_group(sys.argv[1])['b/lines'][:].tolist())"
+    plain, packed = (acquire(name, program=("-c", read)).stdout for name in ("plain.zarr", "run.zarr"))
+    assert packed == plain != ""
+    attrs = json.loads((tmp_path / "run.zarr/zarr.json").read_text())["attributes"]
+    assert [each["name"] for each in attrs["plugins"] if each["kind"] == "codec"] == ["differences"]
+    assert "not readable" not in acquire("info", "run.zarr").stdout
+    assert acquire("verify", "run.zarr").returncode == 0
+    # Here, where nothing of theirs is installed:
+    recording = open_recording(tmp_path / "run.zarr")
+    with pytest.raises(UsageError, match=r"codec 'differences' of lab-extras 0\.3.*lab-extras==0\.3"):
+        recording.cut(0, 100)
+    alone = subprocess.run(
+        [sys.executable, "-m", "acquire", "info", tmp_path / "run.zarr"],
+        check=True,
+        capture_output=True,
+        text=True,
+        timeout=300,
+    )
+    words = " ".join(alone.stdout.split())
+    assert "not readable the pixels are packed by the codec 'differences' of lab-extras 0.3" in words
+    assert "pip install 'lab-extras==0.3'" in words
+
+
+@pytest.mark.parametrize(
+    ("codec", "why"),
+    [
+        ('codec = "differences"\ncodec_options = { level = 11 }', "recording.codec_options.level = 11"),
+        ('codec = "difference"', "did you mean 'differences'?"),
+        ('codec = "haze-lines"', "codec 'haze-lines' of lab-broken 0.1 cannot be used: ModuleNotFoundError"),
+    ],
+)
+def test_codecs_that_cannot_be_used_are_refused(acquire: Run, tmp_path: Path, codec: str, why: str) -> None:
+    (tmp_path / "wrong.toml").write_text(f"{RIG.format(driver='')}[recording]\n{codec}\n")
+    refused = acquire("config", "check", "wrong.toml")
+    assert refused.returncode == 2
+    assert why in refused.stderr
+
+
 def test_options_of_its_camera_are_checked(acquire: Run, tmp_path: Path) -> None:
     (tmp_path / "wrong.toml").write_text(RIG.format(driver='driver = "ramp"\noptions = { step = 0 }'))
     refused = acquire("config", "check", "wrong.toml")
@@ -210,9 +265,15 @@ def test_the_document_can_be_copied_from_top_to_bottom(monkeypatch: pytest.Monke
         module = ModuleType(name)
         monkeypatch.setitem(sys.modules, name, module)
         exec(compile(text, f"{DOCUMENT.name}: {name}", "exec"), vars(module))
-    assert {"Flicker", "Stars", "RampCameras", "SlowLinkTrigger", "LeastSquares", "LocalWiener"} <= set(
-        vars(sys.modules["lab_extras"])
-    )
+    assert {
+        "Flicker",
+        "Stars",
+        "RampCameras",
+        "SlowLinkTrigger",
+        "Differences",
+        "LeastSquares",
+        "LocalWiener",
+    } <= set(vars(sys.modules["lab_extras"]))
 
 
 def test_the_document_shows_what_is_installed_here() -> None:

@@ -1,4 +1,4 @@
-"""Our own effects, solvers and denoisers under the suites that are public for everybody's."""
+"""Our own effects, codecs, solvers and denoisers under the suites that are public for everybody's."""
 
 from __future__ import annotations
 
@@ -8,11 +8,19 @@ import pytest
 from acquire.config import load_scene
 from acquire.forward import DualArm
 from acquire.geometry import Geometry
-from acquire.plugins import EFFECTS
+from acquire.plugins import CODECS, EFFECTS
 from acquire.recon import HaarShrink
 from acquire.sim.effects.base import Effect
 from acquire.sim.scene import SceneModel
-from acquire.testing import DenoiserContract, EffectContract, SceneContract, SolverContract, assert_adjoint
+from acquire.store.variant import CodecVariant
+from acquire.testing import (
+    CodecContract,
+    DenoiserContract,
+    EffectContract,
+    SceneContract,
+    SolverContract,
+    assert_adjoint,
+)
 
 OF_EACH_PLACE = {
     "led_rise_fall": {"rise_s": 3e-6, "fall_s": 5e-6},
@@ -40,6 +48,12 @@ class TestScenes(SceneContract):
         scene = load_scene(request.param)
         assert isinstance(scene, SceneModel)
         return scene
+
+
+class TestCodecs(CodecContract):
+    @pytest.fixture(params=["none", "lz4", "zstd"])
+    def codec(self, request: pytest.FixtureRequest) -> CodecVariant:
+        return CODECS.load(request.param)()
 
 
 class TestAdmm(SolverContract):

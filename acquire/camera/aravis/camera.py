@@ -96,9 +96,11 @@ class AravisCamera:
             raise
 
     def identify(self) -> CameraIdentity:
+        """Return the identity that was read when the camera was opened."""
         return self._identity
 
     def settings(self) -> dict[str, Any]:
+        """Return the settings of camera and stream as read back now, under their SFNC names."""
         return read_settings(self.features())
 
     def features(self) -> dict[str, Features]:
@@ -124,6 +126,7 @@ class AravisCamera:
             self._library.g_object_unref(stream)
 
     def arm(self) -> None:
+        """Allocate buffers and start the acquisition, in a new stream, without frames of an earlier one."""
         self.disarm()
         library, found = self._library, self._format()
         self._missed = MissedTriggers(self.features())
@@ -249,6 +252,7 @@ class AravisCamera:
             raise self._gone("it has restarted")
 
     def release(self, block: CameraBlock) -> None:
+        """Give the block's buffer back to the stream; nothing, if the block is of an earlier acquisition."""
         # None of a block from before `disarm`, which has freed it.
         buffer = self._assembly.release(block) if self._assembly else None
         if buffer is not None and self._stream is not None:
@@ -256,6 +260,7 @@ class AravisCamera:
             self._give(self._stream, buffer)
 
     def disarm(self) -> None:
+        """Stop the acquisition and free its stream and buffers. Idempotent."""
         if not self._armed:
             return
         self._armed = False
@@ -272,9 +277,11 @@ class AravisCamera:
             self._drop()
 
     def statistics(self) -> dict[str, int]:
+        """Return the counters since arm; all 0 before the first one."""
         return self._assembly.statistics() if self._assembly else dict.fromkeys(STATISTICS, 0)
 
     def close(self) -> None:
+        """Stop, and give up control of the device, so that others may open it. Idempotent."""
         self.disarm()
         self._drop()
         if self._camera is not None:

@@ -42,6 +42,7 @@ class AravisFeatures:
         self._library, self._device = library, device
 
     def find(self, name: str) -> AravisNode | None:
+        """Return the feature; None for a category, or if there is none of that name."""
         library = self._library
         node = library.arv_device_get_feature(self._device, name.encode())
         if not node or self._is_category(node):
@@ -59,9 +60,11 @@ class AravisFeatures:
         return bool(self._library.g_type_name_from_instance(node) == b"ArvGcCategory")
 
     def names(self) -> list[str]:
+        """Return the features of all categories."""
         return [name for names in self.categories().values() for name in names]
 
     def categories(self) -> dict[str, list[str]]:
+        """Return category → its features, in the order of the description; empty ones are left out."""
         found: dict[str, list[str]] = {}
         self._collect("Root", found)
         return {name: names for name, names in found.items() if names}
@@ -100,10 +103,12 @@ class AravisNode:
 
     @property
     def readable(self) -> bool:
+        """Whether it is available now, and its access mode allows reading."""
         return self.kind not in ("command", "other") and self._available and self._access in (0, 2)
 
     @property
     def writable(self) -> bool:
+        """Whether it is available now, and its access mode allows writing."""
         return self.kind != "other" and self._available and self._access in (1, 2)
 
     @property
@@ -118,10 +123,12 @@ class AravisNode:
 
     @property
     def selected(self) -> bool:
+        """True for all features: whether a selector changes its value is unknown."""
         # Aravis does not report it. True means that the value is read back only when it is written.
         return True
 
     def read(self) -> Value:
+        """Return the value; a text that is missing is an empty one."""
         with errors(f"read {self.name}", FEATURE) as error:
             get = getattr(self._library, f"arv_device_get_{self._word}_feature_value")
             value = get(self._device, self._key, error)

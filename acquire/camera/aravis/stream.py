@@ -110,20 +110,25 @@ class StreamParameters:
                 self._put(stream, known[name], value)
 
     def find(self, name: str) -> StreamNode | None:
+        """Return the parameter of that name, of the device or of its stream; None if there is none."""
         found = self._of_device.get(name) or _properties(self._library, self._stream()).get(name)
         return StreamNode(self, found) if found else None
 
     def names(self) -> list[str]:
+        """Return the names of all parameters, which takes a stream: one is made if there is none."""
         return [*self._of_device, *_properties(self._library, self._stream())]
 
     def categories(self) -> dict[str, list[str]]:
+        """Return all parameters in one category."""
         return {"StreamControl": names} if (names := self.names()) else {}
 
     def read(self, wanted: _Property) -> Value:
+        """Return the value from the object that has the property."""
         owner = self._device if wanted.name in self._of_device else self._stream()
         return self._get(owner, wanted)
 
     def write(self, wanted: _Property, value: Value) -> None:
+        """Set the value, and keep it for the streams of later acquisitions."""
         if wanted.name in self._of_device:
             self._put(self._device, wanted, value)
             self._drop()  # its packets have been sized already
@@ -163,15 +168,19 @@ class StreamNode:
     selected = False
 
     def read(self) -> Value:
+        """Return the value of the parameter."""
         return self._parameters.read(self._property)
 
     def write(self, value: Value) -> None:
+        """Set the value, for this stream and those that follow."""
         self._parameters.write(self._property, value)
 
     def limits(self) -> tuple[float, float, float]:
+        """Return minimum, maximum and increment; Aravis states none for a float."""
         return *self._property.limits, 1 if self.kind == "integer" else 0
 
     def entries(self) -> list[str]:
+        """Return the names of the values that are possible with this camera."""
         return self._parameters.entries(self._property)
 
 

@@ -29,13 +29,19 @@ _BLOCK_WAIT_S = 0.01
 class LineSource(Protocol):
     """The source of a camera's lines: `acquire.sim.devices.SimulatedCamera`, or a test's own."""
 
-    def arm(self) -> None: ...
+    def arm(self) -> None:
+        """Begin at line 0 of the next run of pulses."""
 
-    def disarm(self) -> None: ...
+    def disarm(self) -> None:
+        """End; the next `arm` counts anew."""
 
-    def next_block(self, timeout_s: float) -> CameraBlock | None: ...
+    def next_block(self, timeout_s: float) -> CameraBlock | None:
+        """Return the next lines; None if none came within ``timeout_s``."""
+        ...
 
-    def times_ns(self, first_line: int, count: int) -> NDArray[np.int64]: ...
+    def times_ns(self, first_line: int, count: int) -> NDArray[np.int64]:
+        """Return when lines were read out, by the camera's own clock, for the stamps of frames."""
+        ...
 
 
 def feed(mailbox: Mailbox, memory: CameraMemory, opener: Callable[[], Any]) -> None:

@@ -4,6 +4,7 @@ from typing import ClassVar, Literal
 
 from acquire.sim.effects.base import Effect, Stage
 from acquire.sim.scene import SceneModel
+from acquire.store.variant import CodecVariant
 
 
 class Nowhere(Effect):
@@ -52,6 +53,16 @@ class OblongScene:
         import numpy as np
 
         return np.ones((count, self.size, self.size - 1), np.float32)
+
+
+class Unnamed(CodecVariant):
+    """A codec that no reader could ask for."""
+
+    def encode(self, data):
+        return data
+
+    def decode(self, data, size):
+        return data
 
 
 class NoProx:

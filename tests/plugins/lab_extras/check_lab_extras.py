@@ -6,7 +6,7 @@ from fractions import Fraction
 
 import numpy as np
 import pytest
-from lab_extras import Flicker, LocalWiener, Stars
+from lab_extras import Differences, Flicker, LocalWiener, Stars
 
 from acquire.codes import ConstantCode
 from acquire.config import load_rig
@@ -15,6 +15,7 @@ from acquire.sim.instrument import SimulatedDevices
 from acquire.testing import (
     CameraContract,
     CameraStand,
+    CodecContract,
     DenoiserContract,
     EffectContract,
     SceneContract,
@@ -41,6 +42,12 @@ class TestStars(SceneContract):
     @pytest.fixture
     def scene(self):
         return Stars(kind="stars", count=5)
+
+
+class TestDifferences(CodecContract):
+    @pytest.fixture
+    def codec(self):
+        return Differences(level=2)
 
 
 class TestLeastSquares(SolverContract):

@@ -1,8 +1,9 @@
-"""What a laboratory adds: a lamp on the mains, stars, a camera that counts, a slow link, least squares."""
+"""What a laboratory adds: a lamp on the mains, stars, a camera that counts, a slow link, a codec, solvers."""
 
 from __future__ import annotations
 
 import time
+import zlib
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar, Literal
 
@@ -18,6 +19,7 @@ from acquire.sim.drivers import SimulatedTrigger
 from acquire.sim.effects.base import Effect, Place, Stage
 from acquire.sim.readout import Readout
 from acquire.sim.scene import MaskScene, SceneModel
+from acquire.store.variant import CodecVariant
 
 
 class Flicker(Effect):
@@ -137,6 +139,27 @@ class SlowLink:
         if data:
             time.sleep(self._delay_s)
         return data
+
+
+class Differences(CodecVariant):
+    """Every line as the bits that differ from the line before, packed by zlib: small where little moves."""
+
+    zarr_name: ClassVar[str] = "lab_extras.differences"
+    level: int = Field(default=1, ge=1, le=9, description="of zlib: 1 is fastest")
+    line_bytes: int = Field(default=1, ge=1, description="set by the recorder")
+
+    def fitted(self, line_bytes, item_bytes):
+        return self.model_copy(update={"line_bytes": line_bytes})
+
+    def encode(self, data):
+        lines = np.frombuffer(data, np.uint8).reshape(-1, self.line_bytes)
+        changes = lines.copy()
+        changes[1:] ^= lines[:-1]
+        return zlib.compress(changes, self.level)
+
+    def decode(self, data, size):
+        changes = np.frombuffer(zlib.decompress(data, bufsize=size), np.uint8)
+        return np.bitwise_xor.accumulate(changes.reshape(-1, self.line_bytes))
 
 
 class LeastSquares(Solver):
