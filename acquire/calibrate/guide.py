@@ -83,6 +83,11 @@ TARGET = Step(
     finds=("orientation", "align"),
     tries=("psf",),
 )
+BLACK = (
+    "The target's dark parts send no light at all, as those of chrome on glass or film lit from behind: also "
+    "measure the lens's veil from it. Not for printed black."
+)
+"""What somebody says who has the target's recording show the veil, too."""
 PSF = Step(
     "psf",
     "Put a square or a checkerboard in, at rest and in focus, turned by 3 to 20 degrees, its edges 30 fine "

@@ -8,7 +8,18 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from acquire.calibrate.guide import AT_ONCE, LINES, MOST_LINES, NOISE_LINES, OPTIONAL, PSF, TARGET, VEIL, Step
+from acquire.calibrate.guide import (
+    AT_ONCE,
+    BLACK,
+    LINES,
+    MOST_LINES,
+    NOISE_LINES,
+    OPTIONAL,
+    PSF,
+    TARGET,
+    VEIL,
+    Step,
+)
 from acquire.cli.calibrate_live import instrument, print_finding, record, save_finding, wait_for_enter
 from acquire.cli.control import SocketOption
 from acquire.cli.output import JsonFlag, note, print_json, print_warning, say
@@ -72,8 +83,7 @@ def calibrate_all(
         bool,
         typer.Option(
             "--black",
-            help="The target's dark parts send no light at all, as those of chrome on glass or film lit from "
-            "behind: also measure the lens's veil from it. Not for printed black.",
+            help=BLACK,
         ),
     ] = False,
     psf: Annotated[

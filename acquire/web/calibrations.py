@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from acquire.calibrate.guide import STEPS, Step
+from acquire.calibrate.guide import BLACK, STEPS, TARGET, Step
 from acquire.errors import AcquireError, DataError, NoDaemonError, PlaceError, UsageError
 from acquire.text import cause_in_words, shortened
 from acquire.web.messages import CalibrationFacts, CalibrationRequest, FindingFacts, StepFacts
@@ -54,7 +54,10 @@ def calibration_facts(place: Path, *, named: bool) -> CalibrationFacts:
 
 
 def step_of(request: CalibrationRequest) -> Step:
-    """Return the step that a request names. Raises UsageError if there is none, or for too few lines."""
+    """Return the step that a request names.
+
+    Raises UsageError if there is none, for too few lines, and for black parts where there is no target.
+    """
     step = next((each for each in STEPS if each.name == request.step), None)
     if step is None:
         raise UsageError(
@@ -64,6 +67,11 @@ def step_of(request: CalibrationRequest) -> Step:
         raise UsageError(
             f"{request.lines} lines are too few for the step {step.name!r}",
             possible=f"{step.least_lines} or more",
+        )
+    if request.black and step is not TARGET:
+        raise UsageError(
+            f"the step {step.name!r} cannot have black parts",
+            possible=f"'black' with the step {TARGET.name!r}",
         )
     return step
 
@@ -79,6 +87,7 @@ def _step(step: Step, known: Calibration | None) -> StepFacts:
         lines=step.lines,
         least_lines=step.least_lines,
         after=step.after,
+        black=BLACK if step is TARGET else "",
         found=found,
     )
 
