@@ -15,10 +15,12 @@ from acquire.calibrate.guide import (
     MOST_LINES,
     NOISE_LINES,
     OPTIONAL,
+    PER_ROW,
     PSF,
     TARGET,
     VEIL,
     Step,
+    lines_of,
 )
 from acquire.cli.calibrate_live import instrument, print_finding, record, save_finding, wait_for_enter
 from acquire.cli.control import SocketOption
@@ -68,8 +70,8 @@ def calibrate_all(
         typer.Option(
             min=64,
             max=MOST_LINES,
-            help=f"Number of lines of each recording. Default: {NOISE_LINES} of dark and flat, {LINES} of "
-            "the others.",
+            help=f"Number of lines of each recording. Default: {NOISE_LINES} of dark, flat and veil, "
+            f"{LINES} of the others; at least {PER_ROW} per fine row if the scene has to be resolved.",
         ),
     ] = None,
     only: Annotated[
@@ -133,6 +135,8 @@ def calibrate_all(
     steps += optional
     found: list[Finding] = []
     with instrument(socket, directory) as daemon:
+        geometry = daemon.setup().config["geometry"]
+        rows = geometry["stages"] * geometry["substeps"]
         if optional:  # refuse before the first recording if the rig cannot measure the optics
             name = optional[0].name
             config = daemon.setup().config
@@ -149,7 +153,7 @@ def calibrate_all(
                     hint=f"leave {name} out, or use a pseudo-random code in the rig file",
                 )
         for step in steps:
-            count = lines or step.lines or LINES
+            count = lines or lines_of(step, rows) or LINES
             found += _step(daemon, step, out, directory, count, ask=not yes, quiet=json)
     if json:
         print_json({"calibration": out, "steps": {each.step: each.facts for each in found}})
