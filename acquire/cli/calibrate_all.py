@@ -152,6 +152,7 @@ def calibrate_all(
                     possible="a pseudo-random code: code.kind = 'prbs'",
                     hint=f"leave {name} out, or use a pseudo-random code in the rig file",
                 )
+        _refuse_out_of_order(steps, out)
         for step in steps:
             count = lines or lines_of(step, rows) or LINES
             found += _step(daemon, step, out, directory, count, ask=not yes, quiet=json)
@@ -159,6 +160,21 @@ def calibrate_all(
         print_json({"calibration": out, "steps": {each.step: each.facts for each in found}})
     else:
         say(f"saved in  {out}; to plot it: acquire calibrate show {out} --out DIR")
+
+
+def _refuse_out_of_order(steps: list[Step], out: str) -> None:
+    """Raise UsageError, before anything is recorded, for a step whose result needs one that was not made."""
+    from acquire.calibrate import open_calibration
+    from acquire.store.source import source_of
+
+    made = set(open_calibration(out).steps) if source_of(out).exists() else set()
+    for step in steps:
+        if step.after and step.after not in made:
+            raise UsageError(
+                f"{step.name} needs the offsets of the columns first",
+                possible=f"acquire calibrate all --only {step.after} --out {out}, then {step.name}",
+            )
+        made.update(step.finds)
 
 
 def _with_veil(step: Step) -> Step:
