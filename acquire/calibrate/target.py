@@ -169,9 +169,10 @@ def alignment(exposure: Exposure, known: Calibration) -> Finding:
             "corrected, but a larger white scene is better"
         )
     elif "balance" in quantities and not shading:
+        more = f"{abs(match.brightness - 1):.1%} {'brighter' if match.brightness > 1 else 'darker'}"
+        than = "in the flat" if "flat" in known.steps else "arm A"
         warnings.append(
-            f"over the field that both arms see, arm B is {match.brightness - 1:+.1%} brighter than in the "
-            "flat: the balance is corrected"
+            f"over the field that both arms see, arm B is {more} than {than}: the balance is corrected"
         )
     if shading:
         x = np.linspace(-1, 1, 65)

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import reduce
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -44,7 +45,7 @@ MISSING = {
 """What a target need not show."""
 INSTEAD = {
     "psf": "nothing corrects it, unless it was measured before; acquire calibrate sheet draws a target that "
-    "shows it, and acquire calibrate all --only psf measures it alone",
+    "shows it if it is turned by 5 degrees at most, and acquire calibrate all --only psf measures it alone",
     "veil": "nothing corrects it, unless it was measured before; acquire calibrate all --only veil measures "
     "it alone, from more lines",
 }
@@ -153,6 +154,7 @@ def calibrate_all(
                     hint=f"leave {name} out, or use a pseudo-random code in the rig file",
                 )
         _refuse_out_of_order(steps, out)
+        _warn_of_delays(out, daemon.setup().config["trigger"])
         for step in steps:
             count = lines or lines_of(step, rows) or LINES
             found += _step(daemon, step, out, directory, count, ask=not yes, quiet=json)
@@ -175,6 +177,23 @@ def _refuse_out_of_order(steps: list[Step], out: str) -> None:
                 possible=f"acquire calibrate all --only {step.after} --out {out}, then {step.name}",
             )
         made.update(step.finds)
+
+
+def _warn_of_delays(out: str, trigger: dict[str, Any]) -> None:
+    """Warn if the calibration has measured delays that the running rig does not have."""
+    from acquire.calibrate import open_calibration
+    from acquire.store.source import source_of
+
+    if not source_of(out).exists():
+        return
+    wanted = open_calibration(out).steps.get("delay", {}).get("rig", {})
+    now = {key: reduce(lambda table, name: table[name], key.split("."), trigger) for key in wanted}
+    if now != wanted:
+        keys = "; ".join(f"trigger.{key} = {ticks}" for key, ticks in wanted.items())
+        print_warning(
+            f"light and charge are apart: the rig lacks the delays that were measured, {keys}; put them into "
+            "the rig file and restart the daemon, or measure the delays again"
+        )
 
 
 def _with_veil(step: Step) -> Step:
@@ -266,5 +285,5 @@ def _evaluations(exposure: Exposure) -> dict[str, Callable[[Calibration], Findin
         "orientation": lambda known: target.orientation(exposure, known),
         "align": lambda known: target.alignment(exposure, known),
         "psf": lambda known: psf.psf(exposure, known),
-        "veil": lambda known: veil.veil(exposure, known),
+        "veil": lambda known: veil.veil_of_black(exposure, known),
     }
