@@ -66,6 +66,12 @@ class Still:
         power, noise = float((image - image.mean()).var()), self.uncertainty**2
         return (float((rough**2).mean()) - noise) / (power - noise) if power > noise else 0.0
 
+    def contrast(self, substeps: int) -> float:
+        """Variation of the image without the noise's, relative to its mean; 0 if there is no light."""
+        image = self.blocks(substeps)[:, self.usable]
+        mean, power = float(image.mean()), float(image.var()) - self.uncertainty**2
+        return power**0.5 / mean if mean > 0 and power > 0 else 0.0
+
     def blocks(self, substeps: int) -> NDArray[np.float64]:
         """Return the image in blocks of S × S fine pixels without overlap: (M, M)."""
         found: NDArray[np.float64] = self.image[substeps - 1 :: substeps]

@@ -23,6 +23,7 @@ from acquire.calibrate.orientation import (
 )
 from acquire.calibrate.still import stills
 from acquire.errors import UsageError
+from acquire.lines import ARMS
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -36,6 +37,11 @@ MOST_LINES = 4096
 """Upper limit on the lines used; more do not make an alignment better than its model."""
 UNLIKE = 0.5
 """Misfit of the arms' images, relative to their variation, beyond which they do not show the same."""
+UNEXPLAINED = 0.5
+"""Part of an arm's lines that no scene at rest under the code explains, beyond which they do not follow it:
+noise alone has 0.9, a target 0.01."""
+PLAIN = 0.1
+"""Variation of an image relative to its mean up to which it shows no target: columns differ by 1 to 3 %."""
 UNREST = 0.3
 """Correlation of the residuals of successive lines from which the target moved. One that moves by 0.3 fine
 pixels while 1024 lines are recorded has 0.4, by one 0.8; the shift is then wrong by 0.01 and by 0.05."""
@@ -60,11 +66,8 @@ def orientation(exposure: Exposure, known: Calibration) -> Finding:
     view, facts = clearest_view(still_a, still_b, exposure.instrument.substeps)
     warnings: tuple[str, ...] = ()
     if view is None:
-        warnings = (
-            f"the orientation is not clear: the best view correlates with {facts['correlation']:.2f}, "
-            f"{facts['next']['view']} with {facts['next']['correlation']:.2f}; a target with sharp, "
-            "irregular texture would show it",
-        )
+        why = _why_unclear((still_a, still_b), facts, exposure.instrument.substeps)
+        warnings = (f"the orientation is not clear: {why}",)
     elif not view.crosses:
         warnings = (
             f"arm B sees the scene with {view.name}: both cameras transfer along the same axis; turn one of "
@@ -76,6 +79,24 @@ def orientation(exposure: Exposure, known: Calibration) -> Finding:
         orientation=None if view is None else view.name,
         facts={**exposure.facts(), **facts},
         warnings=warnings,
+    )
+
+
+def _why_unclear(pair: tuple[Still, Still], facts: dict[str, Any], substeps: int) -> str:
+    """Return what is wrong with the light or the scene, if the images show it, and what would help."""
+    unlit = [arm for arm, each in zip(ARMS, pair, strict=True) if each.misfit > UNEXPLAINED]
+    if unlit:
+        return (
+            f"the lines of arm {' and '.join(unlit)} do not follow the light's code; switch the light on, "
+            "open the lens, and keep the scene at rest"
+        )
+    contrasts = {arm: each.contrast(substeps) for arm, each in zip(ARMS, pair, strict=True)}
+    if plain := {arm: contrast for arm, contrast in contrasts.items() if contrast < PLAIN}:
+        found = " and ".join(f"{contrast:.1%} in arm {arm}" for arm, contrast in plain.items())
+        return f"the scene is nearly uniform, its brightness varies by {found}; put the target in, and focus"
+    return (
+        f"the best view correlates with {facts['correlation']:.2f}, {facts['next']['view']} with "
+        f"{facts['next']['correlation']:.2f}; a target with sharp, irregular texture would show it"
     )
 
 
@@ -148,9 +169,10 @@ def alignment(exposure: Exposure, known: Calibration) -> Finding:
             "corrected, but a larger white scene is better"
         )
     elif "balance" in quantities and not shading:
+        more = f"{abs(match.brightness - 1):.1%} {'brighter' if match.brightness > 1 else 'darker'}"
+        than = "in the flat" if "flat" in known.steps else "arm A"
         warnings.append(
-            f"over the field that both arms see, arm B is {match.brightness - 1:+.1%} brighter than in the "
-            "flat: the balance is corrected"
+            f"over the field that both arms see, arm B is {more} than {than}: the balance is corrected"
         )
     if shading:
         x = np.linspace(-1, 1, 65)

@@ -3,12 +3,26 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import reduce
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from acquire.calibrate.guide import AT_ONCE, LINES, MOST_LINES, NOISE_LINES, OPTIONAL, PSF, TARGET, VEIL, Step
+from acquire.calibrate.guide import (
+    AT_ONCE,
+    BLACK,
+    LINES,
+    MOST_LINES,
+    NOISE_LINES,
+    OPTIONAL,
+    PER_ROW,
+    PSF,
+    TARGET,
+    VEIL,
+    Step,
+    lines_of,
+)
 from acquire.cli.calibrate_live import instrument, print_finding, record, save_finding, wait_for_enter
 from acquire.cli.control import SocketOption
 from acquire.cli.output import JsonFlag, note, print_json, print_warning, say
@@ -31,7 +45,7 @@ MISSING = {
 """What a target need not show."""
 INSTEAD = {
     "psf": "nothing corrects it, unless it was measured before; acquire calibrate sheet draws a target that "
-    "shows it, and acquire calibrate all --only psf measures it alone",
+    "shows it if it is turned by 5 degrees at most, and acquire calibrate all --only psf measures it alone",
     "veil": "nothing corrects it, unless it was measured before; acquire calibrate all --only veil measures "
     "it alone, from more lines",
 }
@@ -57,8 +71,8 @@ def calibrate_all(
         typer.Option(
             min=64,
             max=MOST_LINES,
-            help=f"Number of lines of each recording. Default: {NOISE_LINES} of dark and flat, {LINES} of "
-            "the others.",
+            help=f"Number of lines of each recording. Default: {NOISE_LINES} of dark, flat and veil, "
+            f"{LINES} of the others; at least {PER_ROW} per fine row if the scene has to be resolved.",
         ),
     ] = None,
     only: Annotated[
@@ -72,8 +86,7 @@ def calibrate_all(
         bool,
         typer.Option(
             "--black",
-            help="The target's dark parts send no light at all, as those of chrome on glass or film lit from "
-            "behind: also measure the lens's veil from it. Not for printed black.",
+            help=BLACK,
         ),
     ] = False,
     psf: Annotated[
@@ -123,6 +136,8 @@ def calibrate_all(
     steps += optional
     found: list[Finding] = []
     with instrument(socket, directory) as daemon:
+        geometry = daemon.setup().config["geometry"]
+        rows = geometry["stages"] * geometry["substeps"]
         if optional:  # refuse before the first recording if the rig cannot measure the optics
             name = optional[0].name
             config = daemon.setup().config
@@ -138,13 +153,47 @@ def calibrate_all(
                     possible="a pseudo-random code: code.kind = 'prbs'",
                     hint=f"leave {name} out, or use a pseudo-random code in the rig file",
                 )
+        _refuse_out_of_order(steps, out)
+        _warn_of_delays(out, daemon.setup().config["trigger"])
         for step in steps:
-            count = lines or step.lines or LINES
+            count = lines or lines_of(step, rows) or LINES
             found += _step(daemon, step, out, directory, count, ask=not yes, quiet=json)
     if json:
         print_json({"calibration": out, "steps": {each.step: each.facts for each in found}})
     else:
         say(f"saved in  {out}; to plot it: acquire calibrate show {out} --out DIR")
+
+
+def _refuse_out_of_order(steps: list[Step], out: str) -> None:
+    """Raise UsageError, before anything is recorded, for a step whose result needs one that was not made."""
+    from acquire.calibrate import open_calibration
+    from acquire.store.source import source_of
+
+    made = set(open_calibration(out).steps) if source_of(out).exists() else set()
+    for step in steps:
+        if step.after and step.after not in made:
+            raise UsageError(
+                f"{step.name} needs the offsets of the columns first",
+                possible=f"acquire calibrate all --only {step.after} --out {out}, then {step.name}",
+            )
+        made.update(step.finds)
+
+
+def _warn_of_delays(out: str, trigger: dict[str, Any]) -> None:
+    """Warn if the calibration has measured delays that the running rig does not have."""
+    from acquire.calibrate import open_calibration
+    from acquire.store.source import source_of
+
+    if not source_of(out).exists():
+        return
+    wanted = open_calibration(out).steps.get("delay", {}).get("rig", {})
+    now = {key: reduce(lambda table, name: table[name], key.split("."), trigger) for key in wanted}
+    if now != wanted:
+        keys = "; ".join(f"trigger.{key} = {ticks}" for key, ticks in wanted.items())
+        print_warning(
+            f"light and charge are apart: the rig lacks the delays that were measured, {keys}; put them into "
+            "the rig file and restart the daemon, or measure the delays again"
+        )
 
 
 def _with_veil(step: Step) -> Step:
@@ -236,5 +285,5 @@ def _evaluations(exposure: Exposure) -> dict[str, Callable[[Calibration], Findin
         "orientation": lambda known: target.orientation(exposure, known),
         "align": lambda known: target.alignment(exposure, known),
         "psf": lambda known: psf.psf(exposure, known),
-        "veil": lambda known: veil.veil(exposure, known),
+        "veil": lambda known: veil.veil_of_black(exposure, known),
     }

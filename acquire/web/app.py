@@ -20,7 +20,7 @@ from acquire.daemon.messages import ErrorMessage, on_the_wire
 from acquire.daemon.routes import NO_STORE, RequestId, routes
 from acquire.errors import AcquireError, BusyError, UsageError
 from acquire.web.archive import Archive
-from acquire.web.calibrations import calibration_facts, place_of
+from acquire.web.calibrations import calibration_facts, place_of, rows_of
 from acquire.web.checkup import Checkup
 from acquire.web.guard import Guard
 from acquire.web.hub import Hub
@@ -290,7 +290,8 @@ def _add_calibration(
     @api.get("/calibration", summary="The calibration: its steps and their findings")
     async def calibration() -> CalibrationFacts:
         place, named = place_of(directory, hub.setup)
-        return await reading(lambda: calibration_facts(place, named=named))
+        rows = rows_of(hub.setup)
+        return await reading(lambda: calibration_facts(place, named=named, rows=rows))
 
     @api.post("/calibration", summary="Carry out a calibration step, as a job")
     async def calibrate(asked: CalibrationRequest, request_id: RequestId = None) -> JobFacts:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from acquire.calibrate.guide import STEPS, Step
+from acquire.calibrate.guide import BLACK, STEPS, TARGET, Step, lines_of
 from acquire.errors import AcquireError, DataError, NoDaemonError, PlaceError, UsageError
 from acquire.text import cause_in_words, shortened
 from acquire.web.messages import CalibrationFacts, CalibrationRequest, FindingFacts, StepFacts
@@ -31,8 +31,14 @@ def place_of(directory: Path, setup: Setup | None) -> tuple[Path, bool]:
     return (Path(str(named)), True) if named else (directory / RECORDINGS / UNNAMED, False)
 
 
-def calibration_facts(place: Path, *, named: bool) -> CalibrationFacts:
-    """Return the steps and their findings. Blocks on the disk.
+def rows_of(setup: Setup | None) -> int:
+    """Return the number of fine rows that the rig's sensors see (n = M·S); 0 if it is not known yet."""
+    geometry = {} if setup is None else setup.config.get("geometry", {})
+    return int(geometry.get("stages", 0) * geometry.get("substeps", 0))
+
+
+def calibration_facts(place: Path, *, named: bool, rows: int) -> CalibrationFacts:
+    """Return the steps and their findings, for a sensor that sees ``rows`` fine rows. Blocks on the disk.
 
     If the calibration cannot be read, the error is returned with steps that have no findings.
     """
@@ -46,15 +52,18 @@ def calibration_facts(place: Path, *, named: bool) -> CalibrationFacts:
             if place.exists():
                 raise
             known = None  # no step has been carried out yet
-        steps = [_step(step, known) for step in STEPS]
+        steps = [_step(step, known, rows) for step in STEPS]
     except AcquireError as problem:
         error = shortened(problem.message, 300)
-        steps = [_step(step, None) for step in STEPS]
+        steps = [_step(step, None, rows) for step in STEPS]
     return CalibrationFacts(path=str(place), named=named, error=error, steps=steps)
 
 
 def step_of(request: CalibrationRequest) -> Step:
-    """Return the step that a request names. Raises UsageError if there is none, or for too few lines."""
+    """Return the step that a request names.
+
+    Raises UsageError if there is none, for too few lines, and for black parts where there is no target.
+    """
     step = next((each for each in STEPS if each.name == request.step), None)
     if step is None:
         raise UsageError(
@@ -65,10 +74,15 @@ def step_of(request: CalibrationRequest) -> Step:
             f"{request.lines} lines are too few for the step {step.name!r}",
             possible=f"{step.least_lines} or more",
         )
+    if request.black and step is not TARGET:
+        raise UsageError(
+            f"the step {step.name!r} cannot have black parts",
+            possible=f"'black' with the step {TARGET.name!r}",
+        )
     return step
 
 
-def _step(step: Step, known: Calibration | None) -> StepFacts:
+def _step(step: Step, known: Calibration | None, rows: int) -> StepFacts:
     found = []
     # The first finding is the step's own; the others may come from another step, too.
     if known is not None and step.finds[0] in known.steps:
@@ -76,9 +90,10 @@ def _step(step: Step, known: Calibration | None) -> StepFacts:
     return StepFacts(
         name=step.name,
         prepare=step.prepare,
-        lines=step.lines,
+        lines=lines_of(step, rows),
         least_lines=step.least_lines,
         after=step.after,
+        black=BLACK if step is TARGET else "",
         found=found,
     )
 

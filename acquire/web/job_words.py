@@ -54,7 +54,8 @@ def calibration_words(request: CalibrationRequest, out: Path) -> list[str]:
     steps = {"delay": ["delay"], "linearity": ["linearity"]}
     words = ["calibrate", *steps.get(request.step, ["all", "--only", request.step])]
     lines = [] if request.lines is None else ["--lines", str(request.lines)]
-    return [*words, "--yes", "--out", str(out), "--directory", RECORDINGS, *lines, "--json"]
+    black = ["--black"] if request.black else []
+    return [*words, *black, "--yes", "--out", str(out), "--directory", RECORDINGS, *lines, "--json"]
 
 
 def progress_facts(line: str) -> dict[str, Any]:

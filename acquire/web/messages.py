@@ -131,6 +131,9 @@ class CalibrationRequest(Message):
     lines: int | None = Field(
         default=None, strict=True, ge=1, le=2**20, description="lines of each recording; absent: the default"
     )
+    black: bool = Field(
+        default=False, description="the target's dark parts send no light, and also show the lens's veil"
+    )
 
 
 class JobFacts(Message):
@@ -184,6 +187,7 @@ class StepFacts(Message):
     lines: int | None = Field(description="default lines of each recording; null: as many as it needs")
     least_lines: int
     after: str = Field(description="the step that must precede it; empty: none")
+    black: str = Field(description="what `black` of a request says of the scene; empty: no such choice")
     found: list[FindingFacts]
 
 

@@ -60,12 +60,20 @@ def test_orientation_is_relative_to_arm_a(tmp_path: Path) -> None:
     assert orientation(open_exposure(path), empty(path)).orientation == "turn 270"
 
 
-@pytest.mark.parametrize("which", ["black", "white"])
-def test_a_scene_without_texture_gives_no_orientation(tmp_path: Path, which: str) -> None:
-    path = record(tmp_path / "plain.zarr", white(0.4 if which == "white" else 0.0, NOISE), "target", 256)
+@pytest.mark.parametrize(
+    ("level", "why"),
+    [
+        (0.0, "lines of arm a and b do not follow the light's code; switch"),
+        (0.4, "nearly uniform, its brightness"),
+    ],
+    ids=["black", "white"],
+)
+def test_a_scene_without_texture_gives_no_orientation(tmp_path: Path, level: float, why: str) -> None:
+    path = record(tmp_path / "plain.zarr", white(level, NOISE), "target", 256)
     found = orientation(open_exposure(path), empty(path))
     assert found.orientation is None
-    assert "is not clear" in found.warnings[0]
+    assert found.warnings[0].startswith("the orientation is not clear: ")
+    assert why in found.warnings[0]
     with pytest.raises(UsageError, match="does not determine the alignment"):
         alignment(open_exposure(path), empty(path))
 

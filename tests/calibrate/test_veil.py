@@ -13,7 +13,7 @@ from test_psf import RIG, SIZE, board
 from acquire.calibrate import Calibration, Measured, calibrated
 from acquire.calibrate.columns import dark
 from acquire.calibrate.exposure import open_exposure
-from acquire.calibrate.veil import veil
+from acquire.calibrate.veil import veil, veil_of_black
 from acquire.calibrate.words import known_facts
 from acquire.errors import UsageError
 from acquire.forward import DualArm
@@ -76,8 +76,11 @@ def test_a_dark_makes_offsets_no_veil(tmp_path: Path) -> None:
 
 
 def test_dark_parts_that_are_grey_are_doubted_or_refused(tmp_path: Path) -> None:
-    grey = measured(taken(tmp_path / "grey.zarr", 0.04 + 0.96 * board(11.0)))
-    assert "are the target's dark parts black?" in " ".join(grey.warnings)
+    ink = open_exposure(taken(tmp_path / "grey.zarr", 0.04 + 0.96 * board(11.0)))
+    nothing = Calibration(ink.instrument)
+    assert "are the target's dark parts black?" in " ".join(veil(ink, nothing).warnings)
+    with pytest.raises(UsageError, match="more than lenses spread, and so they are not black"):
+        veil_of_black(ink, nothing)
     with pytest.raises(UsageError, match=r"its darkest parts have \d+% of the mean light"):
         measured(taken(tmp_path / "even.zarr", np.full((SIZE, SIZE), 0.5, np.float32)))
 

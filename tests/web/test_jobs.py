@@ -201,4 +201,6 @@ def test_a_request_that_is_repeated_is_carried_out_once(tmp_path: Path) -> None:
             assert ask.post(path, json=asked, headers=headers).json() == first.json()
             other = ask.post(path, json={**asked, "lines": 4000}, headers=headers)
             assert "was given to another request before" in other.json()["message"]
+        refused = ask.post("/calibration", json={"step": "flat", "black": True})
+        assert "the step 'flat' cannot have black parts" in refused.json()["message"]
         assert sorted(job["kind"] for job in ask.get("/jobs").json()) == ["calibrate", "cut"]

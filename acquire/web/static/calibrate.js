@@ -55,16 +55,16 @@ export class Calibrate {
     $("calibration-place").textContent = facts.error ?? `${facts.path}. ${facts.named ? "The rig names it: every recording gets a copy." : `Recordings will get a copy once the rig file sets calibration = "${facts.path}".`}`;
     $("calibration-place").className = facts.error ? "bad" : "hint";
     if (!this.#cards.size) {
-      for (const step of facts.steps) this.#cards.set(step.name, new Card(step, (lines) => this.#begin(step.name, lines), () => this.#cancel()));
+      for (const step of facts.steps) this.#cards.set(step.name, new Card(step, (asked) => this.#begin(step.name, asked), () => this.#cancel()));
       $("steps").replaceChildren(...[...this.#cards.values()].map((card) => card.element));
     }
     for (const step of facts.steps) this.#cards.get(step.name).found(step.found);
     this.#enable();
   }
 
-  async #begin(step, lines) {
+  async #begin(step, asked) {
     this.#fail("");
-    try { this.#job = await ask("POST", "calibration", lines === null ? { step } : { step, lines }); this.#showJob(); await this.#follow(); }
+    try { this.#job = await ask("POST", "calibration", { step, ...asked }); this.#showJob(); await this.#follow(); }
     catch (error) { this.#fail(error.message); }
   }
 
@@ -94,7 +94,7 @@ export class Calibrate {
 
 class Card {
   #state = make("span"); #text = make("p", { role: "status" }); #bar = make("progress", { hidden: true }); #found = make("div");
-  #lines; #begin; #cancel; #why = make("p", { className: "hint" }); #running = false;
+  #lines; #black = make("input", { type: "checkbox" }); #begin; #cancel; #why = make("p", { className: "hint" }); #running = false;
 
   constructor(step, begin, cancel) {
     const title = TITLES[step.name] ?? step.name;
@@ -102,13 +102,17 @@ class Card {
     this.#begin = make("button", { className: "primary", id: `begin-${step.name}`, onclick: () => this.#ask(begin) }, `Measure ${title.toLowerCase()}`);
     this.#cancel = make("button", { id: `cancel-${step.name}`, hidden: true, onclick: cancel, "aria-label": `Cancel ${title.toLowerCase()}` }, "Cancel");
     this.#bar.setAttribute("aria-label", `Progress of ${title.toLowerCase()}`);
+    this.#black.id = `black-${step.name}`;
     this.#why.id = `why-${step.name}`;
     this.#begin.setAttribute("aria-describedby", this.#why.id);
-    this.element = make("li", { id: `step-${step.name}` }, make("h3", {}, title, this.#state), make("p", {}, step.prepare),
+    this.element = make("li", { id: `step-${step.name}` }, make("h3", {}, title, this.#state), make("p", {}, step.prepare), step.black ? make("label", {}, this.#black, " ", step.black) : null,
       make("div", { className: "fields" }, make("label", {}, "Lines ", this.#lines), this.#begin, this.#cancel), this.#why, this.#bar, this.#text, this.#found);
   }
 
-  #ask(begin) { if (this.#lines.reportValidity()) begin(this.#lines.value === "" ? null : Number(this.#lines.value)); }
+  #ask(begin) {
+    if (!this.#lines.reportValidity()) return;
+    begin({ ...(this.#lines.value === "" ? {} : { lines: Number(this.#lines.value) }), ...(this.#black.checked ? { black: true } : {}) });
+  }
 
   enable(why, operator) {
     this.#begin.disabled = Boolean(why) || this.#running;
