@@ -11,7 +11,7 @@ from acquire.cli.completion import states
 from acquire.cli.durations import seconds
 from acquire.cli.output import JsonFlag, print_json, print_warning, say
 from acquire.cli.spelled import spelled
-from acquire.cli.status_page import show, show_document
+from acquire.cli.status_page import show, show_document, without_code
 from acquire.daemon.glance import NO_ANSWER, status_document
 from acquire.daemon.options import ArmOptions, StartOptions
 from acquire.errors import DataError, UsageError
@@ -88,7 +88,10 @@ def start(
     Example: [bold]acquire start run.zarr --lines 100000[/], or [bold]acquire start --pre 2s --post 1s[/]
     """
     with _daemon(socket) as daemon:
-        show(daemon.start(path, **options), json)
+        status = daemon.start(path, **options)
+    show(status, json)
+    if status.light in ("dark", "steady"):
+        print_warning(without_code(status.light))
 
 
 def mark(

@@ -58,6 +58,7 @@ def status_lines(status: Facts) -> list[str]:
         "disk": _trouble_with_disk(status) or _disk(status["disk"]),
         "trigger": _trigger(status["trigger"]),
         "sustains": _capacity(status),
+        "light": _light(status),
         "calibration": status["calibration"] and status["calibration"]["text"],
         "troubles": "; ".join(troubles) or None,
         "possible": ", ".join(status["possible"]),
@@ -163,6 +164,20 @@ def _trigger(trigger: Facts | None) -> str | None:
         f"clock {quantity(trigger['clock_hz'], 'Hz')}, UTC known to {trigger['uncertainty_ns'] / 1000:.3g} us"
     )
     return f"{answers}, {counted(trigger['pulses'], 'line')}, {clock}"
+
+
+def _light(status: Facts) -> str | None:
+    light = status.get("light")
+    return None if light in (None, "rig") else f"WARNING: {without_code(light)}"
+
+
+def without_code(light: str) -> str:
+    """Return what a run is not good for whose light is ``"dark"`` or ``"steady"``, and what to do."""
+    state = "off" if light == "dark" else "on"
+    return (
+        f"the light stays {state}, as for a calibration, so that no video can be reconstructed from these "
+        "lines; for the rig's code: acquire disarm, then acquire arm"
+    )
 
 
 def _trouble_with_disk(status: Facts) -> str | None:

@@ -368,6 +368,10 @@ class Status(Message):
     calibration: CalibrationStatus | None = Field(
         default=None, description="null: not armed, or the rig names none"
     )
+    light: LightCode | None = Field(
+        default=None,
+        description="what the light follows in this run, see `ArmRequest.code`; null: not armed",
+    )
     processes: dict[str, int] = Field(default={}, description="processes of the run: name → process number")
     recoveries: list[RecoveryStatus] = Field(
         default=[], description="the latest recordings that were not sealed"

@@ -9,6 +9,7 @@ if TYPE_CHECKING:
 
     from acquire.config.recording import RecordingConfig
     from acquire.daemon.messages import ArmRequest, CalibrationStatus, CapacityStatus
+    from acquire.daemon.options import LightCode
     from acquire.store import RecordingSpec
     from acquire.stream import Begin, CaptureStatus, Note
     from acquire.stream.ring import RingShape
@@ -54,6 +55,11 @@ class ServiceRun(Protocol):
     @property
     def capture(self) -> CapturePath:
         """The processes of this run."""
+        ...
+
+    @property
+    def light(self) -> LightCode:
+        """What the light follows: the rig's code, or constantly off or on."""
         ...
 
     @property

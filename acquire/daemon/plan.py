@@ -42,14 +42,15 @@ class Run:
         rig: Rig,
         choose: Callable[[RigConfig], CodecChoice] = choose_for,
         devices: KnownDevices | None = None,
+        light: LightCode = "rig",
     ) -> None:
         """Prepare a run without touching a device; ``choose`` finds the codec if that is ``auto``.
 
-        ``devices`` remembers those that were armed.
+        ``devices`` remembers those that were armed, and ``light`` is what the code in ``config`` was made of.
 
         Raises UsageError for a configuration, or calibration, that cannot work.
         """
-        self.run_id = new_run_id(config.name)
+        self.run_id, self.light = new_run_id(config.name), light
         self._config = config
         self._rig = rig
         self._choose = choose

@@ -92,7 +92,7 @@ def serve(config: RigConfig, origin: str = "", reread: Callable[[], RigConfig] |
             # Not the outer `config`: the service's may have been reloaded.
             config = armed_as(service.config, request)
             check_rig(config)
-            return Run(config, rig, proof.choose, devices)
+            return Run(config, rig, proof.choose, devices, request.code)
 
         disk = disk_watch(config, claim)
         service = Service(config, open_run, proof, salvage, uploads, troubles, disk)

@@ -457,11 +457,9 @@ class Service:
         before = self._now.state
         self._now.go(event)
         level = logging.ERROR if event is Event.FAULT else logging.INFO
-        log.log(
-            level, "%s → %s (%s%s)", before, self._now.state, event, f": {why}" if why else "", extra=EACH
-        )
-        path = self._take.path if self._take else self._last.path if self._last else None
         news = f"{event}: {why}" if why else str(event)
+        log.log(level, "%s → %s (%s)", before, self._now.state, news, extra=EACH)
+        path = self._take.path if self._take else self._last.path if self._last else None
         importance = "error" if event is Event.FAULT else "info"
         self.news.add("state", news, self._now.state, level=importance, path=path)
         self._publish()
@@ -487,6 +485,7 @@ class Service:
             fault=self._now.fault,
             capacity=self._capacity,
             calibration=None if self._run is None else self._run.calibration,
+            light=None if self._run is None else self._run.light,
             processes={} if self._run is None else self._seen.pids,
             recoveries=self._salvage.recoveries,
             uploads=self._uploads.statuses,

@@ -139,6 +139,25 @@ def test_commands_pass_on_the_options_that_were_given(
     ]
 
 
+@pytest.mark.parametrize(("light", "state"), [("dark", "off"), ("steady", "on")])
+def test_a_start_without_the_lights_code_is_warned_of(
+    cli: Cli, answering: Callable[[Status], FakeClient], light: str, state: str
+) -> None:
+    """A calibration that was killed leaves the instrument armed like that."""
+    answering(status(State.RECORDING, light=light))
+    told = f"the light stays {state}, as for a calibration"
+    answer = cli("start", "x.zarr")
+    assert answer.code == 0
+    assert told in answer.err
+    assert f"WARNING: {told}" in cli("status").out
+
+
+def test_the_rigs_own_code_is_not_mentioned(cli: Cli, answering: Callable[[Status], FakeClient]) -> None:
+    answering(status(State.RECORDING, light="rig"))
+    answer = cli("start", "x.zarr")
+    assert "light" not in answer.out + answer.err
+
+
 def test_wait_passes_on_state_and_time(cli: Cli, answering: Callable[[Status], FakeClient]) -> None:
     client = answering(status(State.IDLE))
     assert cli("status", "--wait", "idle", "--timeout", 300).code == 0

@@ -47,6 +47,7 @@ class FakeRun:
     """Records what it is told in ``calls``; ``refuse`` maps a call to the error it raises."""
 
     run_id = "fake-run"
+    light = "rig"
     calibration = None
 
     def __init__(self, **refuse: Exception) -> None:

@@ -153,7 +153,11 @@ def test_dark_flat_target_by_hand(bench: tuple[Daemon, Callable[[str], None]], t
 def _handed_on(daemon: Daemon, home: Path) -> None:
     """From then on every recording gets a copy, unless the user declines."""
     with daemon.client() as client:
-        calibration = client.arm().calibration
+        assert client.arm(code="steady").light == "steady"
+        assert client.disarm().light is None
+        armed = client.arm()
+        calibration = armed.calibration
+        assert armed.light == "rig"
         assert calibration is not None
         assert calibration.carried
         client.start(home / "run.zarr", lines=64)

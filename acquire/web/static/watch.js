@@ -118,6 +118,7 @@ export class Watch {
     facts.push(["Trigger", status.trigger ? `${status.trigger.answers ? "answers" : `SILENT for ${duration(status.trigger.silent_s)}`}, ${counted(status.trigger.pulses, "line")}` : "–"]);
     facts.push(["Disk", status.disk_trouble ? `✗ ${status.disk_trouble}` : status.disk ? `${quantity(status.disk.free_bytes, "B")} free, full in ${duration(status.disk.seconds_to_full)}` : "–"]);
     facts.push(["Last", status.last ? `${name(status.last.path)}, ${counted(status.last.lines, "line")}, ${status.last.condition ?? "not sealed"}` : "–"]);
+    if (status.light && status.light !== "rig") facts.push(["Light", `✗ stays ${status.light === "dark" ? "off" : "on"}, as for a calibration: disarm, then arm`]);
     if (status.waiting) facts.push(["Waiting", status.waiting]);
     fill($("now"), JSON.stringify(facts), () => facts.flatMap(([term, text]) => [make("dt", {}, term), make("dd", {}, text)]));
   }
