@@ -230,6 +230,9 @@ def _cycle(bench: Workbench, cosines: InBand, rises: tuple[float, ...], rival: f
     cycle = bench.repeat(*repeats, rival)
     if REPEATS * rival <= cycle.error < rival:
         cycle = _or_turning(cycle, rival)
+        # Sharp edges take more harmonics than a first trial has.
+        finer = cycle.candidate.with_coefficients(1, bench.frames)
+        cycle = cycle if finer is None else _better(cycle, finer)
     return cycle if cycle.error < REPEATS * rival else None
 
 

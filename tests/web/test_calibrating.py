@@ -25,6 +25,7 @@ if TYPE_CHECKING:
 pytestmark = pytest.mark.needs_chromium
 
 SEEN_MS = 240_000
+SETTLED_MS = 5_000
 SCREENSHOTS = os.environ.get("ACQUIRE_SCREENSHOTS")
 
 
@@ -68,7 +69,9 @@ def fits(page: Page, name: str) -> None:
         page.emulate_media(color_scheme=theme)  # type: ignore[arg-type]
         for width in (400, 1024, 1280):
             page.set_viewport_size({"width": width, "height": 900})
-            assert page.evaluate("document.documentElement.scrollWidth") <= width
+            # A picture adapts to another width a moment later.
+            fitting = "width => document.documentElement.scrollWidth <= width"
+            page.wait_for_function(fitting, arg=width, timeout=SETTLED_MS)
             if SCREENSHOTS:
                 page.screenshot(path=Path(SCREENSHOTS) / f"{name}-{theme}-{width}.png", full_page=True)
 
