@@ -80,7 +80,7 @@ def fit_brightness(
     if not normal.any():
         return np.ones(frames)  # a dark video explains nothing, however bright
     normal, right, energy = normal * INDEPENDENT, right * INDEPENDENT, energy * INDEPENDENT
-    counted = round(samples * INDEPENDENT)
+    counted = max(1, round(samples * INDEPENDENT))
     # The prior draws to g = 1, so that g − 1 is solved for.
     flat = basis @ np.ones(frames)
     left = NormalEquations(normal, right, energy, counted).left(flat)

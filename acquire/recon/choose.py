@@ -167,9 +167,7 @@ def _choose(bench: Workbench, volume: Trial, trials: int) -> Estimate:
     # Evident lamps need the time for themselves.
     followed = None if clear or lamps else _try_motion(bench, tried, cosines, at_a_glance)
     if not (clear or tried.flows):
-        # Evident lamps need the time that changes of speed take, which is 3 % of 10 s.
-        rises = (0.0,) if lamps else TRIED_CHANGES
-        tried.cycle = _cycle(bench, cosines, rises, min(at_a_glance, tried.best.error))
+        tried.cycle = _cycle(bench, cosines, min(at_a_glance, tried.best.error), lamps=lamps)
     tried.followed = followed  # from now on: a cycle at rest competes with what is at rest
     ahead, refined = at_a_glance <= OUTDONE * tried.best.error, None
     if ahead:
@@ -222,16 +220,17 @@ def _in_its_light(followed: Trial, cosines: int) -> Trial:
     return lit if lit is not None and lit.error < BRIGHTER * followed.error else followed
 
 
-def _cycle(bench: Workbench, cosines: InBand, rises: tuple[float, ...], rival: float) -> Trial | None:
-    """The video as a cycle, if it repeats and predicts far better than a rival."""
-    repeats = find_period(cosines.solver.theta, cosines.basis, rises)
+def _cycle(bench: Workbench, cosines: InBand, rival: float, *, lamps: bool) -> Trial | None:
+    """The video as a cycle, if it repeats and predicts far better than a rival; less is tried for lamps."""
+    # Evident lamps need the time that changes of speed take, which is 3 % of 10 s.
+    repeats = find_period(cosines.solver.theta, cosines.basis, (0.0,) if lamps else TRIED_CHANGES)
     if repeats is None or bench.clock.spent(SEARCH_SHARE):
         return None
     cycle = bench.repeat(*repeats, rival)
     if REPEATS * rival <= cycle.error < rival:
         cycle = _or_turning(cycle, rival)
-        # Sharp edges take more harmonics than a first trial has.
-        finer = cycle.candidate.with_coefficients(1, bench.frames)
+        # Sharp edges that move take more harmonics than a first trial has. Lamps are better off in patterns.
+        finer = None if lamps else cycle.candidate.with_coefficients(1, bench.frames)
         cycle = cycle if finer is None else _better(cycle, finer)
     return cycle if cycle.error < REPEATS * rival else None
 

@@ -396,8 +396,9 @@ class Capture:
         check: dict[str, Any] = {}
         if WATCHER in self._counters:
             seen = self._counters[WATCHER]
-            check = {name: seen[f"{name}_{arm}"] for name in ("shift", "checked_line", "lapped")}
-            check["verdict"] = str(watcher.VERDICTS[seen[f"verdict_{arm}"]])
+            # The verdict first, which is written last.
+            check = {"verdict": str(watcher.VERDICTS[seen[f"verdict_{arm}"]])}
+            check |= {name: seen[f"{name}_{arm}"] for name in ("shift", "checked_line", "lapped")}
         return {
             "delivered": grabbed["delivered"],
             "preroll": grabbed["preroll"],

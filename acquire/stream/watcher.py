@@ -165,9 +165,10 @@ class Watcher:
         self._intakes.clear()
         for arm, finding in found.items():
             self._locate(arm, finding, first_line)
-            self._counters[f"verdict_{arm}"] = VERDICTS.index(finding.verdict)
             self._counters[f"shift_{arm}"] = finding.shift
             self._counters[f"checked_line_{arm}"] = first_line + self._plan.lines
+            # Last, so that whoever sees a first verdict also sees its shift.
+            self._counters[f"verdict_{arm}"] = VERDICTS.index(finding.verdict)
             self._counters.add(f"checks_{arm}", 1)
         # Report a change of verdict or shift, not of the peak, which differs from check to check.
         last = {arm: (finding.verdict, finding.shift) for arm, finding in self._reported.items()}

@@ -74,6 +74,7 @@ def test_the_gateware_gets_few_clocks_in_the_same_substep() -> None:
         "trigger.driver": "rtl",
         "trigger.clock_hz": 6_000_000,
         "trigger.substep_ticks": 60,
+        "stream.stall_s": 30,
     }
     assert rtl.command == "acquire demo --seed 1 --lines 33334 --trigger rtl"
 

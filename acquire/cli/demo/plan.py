@@ -83,7 +83,13 @@ def trigger_settings(plan: DemoPlan) -> dict[str, str | int]:
     # Whole clocks only, so that the sub-step lasts exactly as long as in the rig file.
     if ticks % RTL_TICKS == 0 and clock_hz * RTL_TICKS // ticks >= RTL_LEAST_HZ:
         ticks, clock_hz = RTL_TICKS, clock_hz * RTL_TICKS // ticks
-    return {"trigger.driver": "rtl", "trigger.clock_hz": clock_hz, "trigger.substep_ticks": ticks}
+    # Every clock is computed, so that other programs may hold up the lines for seconds.
+    return {
+        "trigger.driver": "rtl",
+        "trigger.clock_hz": clock_hz,
+        "trigger.substep_ticks": ticks,
+        "stream.stall_s": 30,
+    }
 
 
 def rig_of(config: str, cameras: str) -> str:
