@@ -36,7 +36,7 @@ class VariantCodec(BytesBytesCodec):
         return {"name": self.variant.zarr_name, "configuration": self.codec.model_dump(mode="json")}
 
     def compute_encoded_size(self, input_byte_length: int, chunk_spec: ArraySpec) -> int:
-        """Raise NotImplementedError, by which zarr knows that the size depends on the content."""
+        """Raise NotImplementedError, as the other codecs of zarr whose size depends on the content do."""
         raise NotImplementedError
 
     async def _encode_single(self, chunk_data: Buffer, chunk_spec: ArraySpec) -> Buffer | None:
