@@ -25,7 +25,7 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
 from acquire.config.scene import ArmOptics, OpticsConfig
-from acquire.errors import UsageError
+from acquire.errors import NumericsError, UsageError
 from acquire.lines import ARMS
 from acquire.sim.light import Illumination
 from acquire.sim.optics import laid_out
@@ -96,8 +96,14 @@ class StreamingArm:
         )
 
     def lines(self, first_line: int, count: int) -> NDArray[np.float32]:
-        """Return Y of lines ``first_line .. first_line + count - 1``, (count, M); preroll is below 0."""
-        return self._lines.lines(first_line, count)
+        """Return Y of lines ``first_line .. first_line + count - 1``, (count, M); preroll is below 0.
+
+        Raises NumericsError if the scene's light is not a number, which a camera would round to some DN.
+        """
+        lines = self._lines.lines(first_line, count)
+        if np.isnan(lines).any():
+            raise NumericsError("the scene gave back values that are not numbers (NaN)")
+        return lines
 
 
 class _Lines(Protocol):
@@ -214,6 +220,12 @@ class FrameLines:
         if not len(lit):
             return
         frames = frames_at(self._scene, first + lit)
+        # The compiled loops look at no bounds.
+        if frames.shape != (len(lit), self._scene.size, self._width):
+            raise UsageError(
+                f"the scene gave back shape {frames.shape} for {len(lit)} frames",
+                possible=f"shape {(len(lit), self._scene.size, self._width)}",
+            )
         newest = first + lit - first_packet
         if self._along_rows:
             self._kernels.add_along_rows(frames, light[lit], newest, self._rows, packets)

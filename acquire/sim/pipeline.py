@@ -190,9 +190,7 @@ class ArmSensor(ArmSource):
         if index not in self._tiles:
             pixels, missing = self._digital(index), np.zeros(TILE_LINES, np.bool_)
             for stage in self._by_place["stream"]:
-                given = pixels
-                pixels, lost = stage.run(given, index * TILE_LINES, lambda: self._digital(index - 1)[-1:])
-                _check_shape(stage, given, pixels)
+                pixels, lost = stage.run(pixels, index * TILE_LINES, lambda: self._digital(index - 1)[-1:])
                 missing = missing if lost is None else missing | lost
             tile = Readout(np.where(missing[:, None], 0, pixels).astype(pixels.dtype), missing)
             # The last two are kept: a block of lines may begin in one tile and end in the next.
@@ -205,10 +203,10 @@ class ArmSensor(ArmSource):
         # the responsivity is DN per unit of light, the gain DN per electron
         electrons = light.astype(np.float64) * (self._converter.responsivity_dn / self._gain)
         for stage in self._by_place["charge"]:
-            electrons = _check_shape(stage, electrons, stage.run(electrons, first_line))
+            electrons = stage.run(electrons, first_line)
         dn = electrons * self._gain + self._converter.black_level_dn
         for stage in self._by_place["readout"]:
-            dn = _check_shape(stage, dn, stage.run(dn, first_line))
+            dn = stage.run(dn, first_line)
         return self._converter.round(dn)
 
 
@@ -281,20 +279,8 @@ class _Image:
         else:
             lines = self._arm.lines(first_line, count)
         for stage in self._signal:
-            lines = _check_shape(stage, lines, stage.run(lines, first_line))
+            lines = stage.run(lines, first_line)
         return lines
-
-
-def _check_shape(stage: Stage, given: NDArray[Any], found: NDArray[Any]) -> NDArray[Any]:
-    """Return what a stage made of lines. Raises UsageError, with its name, if the shape is wrong."""
-    wanted = (len(given) - stage.lead, *given.shape[1:])
-    if np.shape(found) != wanted:
-        raise UsageError(
-            f"effect {stage.effect} gave back shape {np.shape(found)} for lines of shape {given.shape}"
-            + (f" with {stage.lead} in advance" if stage.lead else ""),
-            possible=f"shape {wanted}",
-        )
-    return found
 
 
 def describe(scene: SceneConfig) -> dict[str, Any]:

@@ -10,6 +10,7 @@ from pydantic import Field, model_validator
 from acquire.config.scene import OpticsConfig, SceneConfig
 from acquire.errors import UsageError
 from acquire.sim.scene import SceneModel, add
+from acquire.text import shown
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -24,11 +25,18 @@ def build_scene(config: SceneBase, size: int, substep_s: float) -> Scene:
     Raises UsageError for files, pictures and functions that do not make a scene.
     """
     scene = cast("SceneModel", config).build(size, substep_s)
-    shape = np.shape(scene.frames(0, 1))
-    if shape != (1, size, size):
+    if not callable(getattr(scene, "frames", None)):
         raise UsageError(
-            f"scene {config.kind!r} gave back a frame of shape {shape[1:]}", possible=f"{size} × {size}"
+            f"scene {config.kind!r} gave back {shown(scene)}", possible="an object with frames(first, count)"
         )
+    frames = np.asarray(scene.frames(0, 1))
+    if frames.shape != (1, size, size):
+        raise UsageError(
+            f"scene {config.kind!r} gave back shape {frames.shape} for one frame",
+            possible=f"(1, {size}, {size})",
+        )
+    if frames.dtype.kind not in "fiub":
+        raise UsageError(f"scene {config.kind!r} gave back {frames.dtype} pixels", possible="real numbers")
     if not config.shutters:
         return scene
     from acquire.sim.shutters import ShutteredScene, build_shutter

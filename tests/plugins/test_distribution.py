@@ -130,8 +130,14 @@ def test_a_misspelt_group_is_named(acquire: Run) -> None:
 @pytest.mark.parametrize(
     ("scene", "effect", "code", "told"),
     [
-        ("oblong", "", 2, "scene 'oblong' gave back a frame of shape (16, 15)\n  possible: 16 × 16"),
+        (
+            "oblong",
+            "",
+            2,
+            "scene 'oblong' gave back shape (1, 16, 15) for one frame\n  possible: (1, 16, 16)",
+        ),
         ("stars", "short", 2, "effect short gave back shape (255, 8) for lines of shape (256, 8)"),
+        ("stars", "hollow", 1, "effect hollow gave back values that are not numbers (NaN)"),
         ("stars", "raises", 1, "This error arose in a plug-in: lab_careless of lab-broken 0.1."),
     ],
 )

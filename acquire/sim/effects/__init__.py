@@ -43,7 +43,10 @@ def _order(effect: Effect | type[Effect], kind: str = "") -> tuple[int, float, s
 
 def build_stages(effects: Iterable[Any], setting: Setting) -> list[Stage]:
     """Return the stages of the listed effects on one arm, in the order in which they act."""
-    stages = [stage for effect in in_order(effects) for stage in effect.stages(setting)]
+    # Not imported by scenes without effects.
+    from acquire.sim.effects.checked import checked_stages
+
+    stages = [s for effect in in_order(effects) for s in checked_stages(effect.kind, effect.stages(setting))]
     # An effect may act in several places. Sorting is stable: within a place the order of the effects remains.
     return sorted(stages, key=lambda stage: PLACES.index(stage.place))
 

@@ -26,6 +26,16 @@ class Short(Effect):
         return [Stage("short", "readout", lambda dn, first: dn[1:])]
 
 
+class Hollow(Effect):
+    """An effect whose numbers are none."""
+
+    kind: Literal["hollow"]
+    place: ClassVar = "readout"
+
+    def stages(self, setting):
+        return [Stage("hollow", "readout", lambda dn, first: dn * float("nan"))]
+
+
 class Raises(Effect):
     """An effect with a defect."""
 
