@@ -219,7 +219,7 @@ def _unsuitable(group: Group, entry: metadata.EntryPoint, loaded: Any) -> str:
     module, _, name = group.base.partition(":")
     base = getattr(importlib.import_module(module), name)
     if group is DENOISERS:
-        return _unsuitable_denoiser(entry, loaded)
+        return _unsuitable_denoiser(entry, loaded) or _miscalled(base, entry, loaded)
     if not (isinstance(loaded, type) and issubclass(loaded, base)):
         return f"{entry.value} is not a class that extends {module}.{name}"
     if missing := sorted(getattr(loaded, "__abstractmethods__", ())):
@@ -228,7 +228,29 @@ def _unsuitable(group: Group, entry: metadata.EntryPoint, loaded: Any) -> str:
     if kind is not None and get_args(kind.annotation) != (entry.name,):
         return f"{entry.value} needs kind: Literal[{entry.name!r}], the name of its entry point"
     flaw: str = getattr(loaded, "flaw", str)()
-    return f"{entry.value} {flaw}" if flaw else ""
+    return f"{entry.value} {flaw}" if flaw else _miscalled(base, entry, loaded)
+
+
+def _miscalled(base: type, entry: metadata.EntryPoint, loaded: type) -> str:
+    """Return which method does not take the arguments of the base's, or an empty text.
+
+    When it is called, the error arises in our module, and does not show whose the method is.
+    """
+    methods = [part for each in base.__mro__ if each.__module__.startswith("acquire.") for part in vars(each)]
+    for name in methods:
+        theirs, ours = (inspect.getattr_static(each, name, None) for each in (loaded, base))
+        if (
+            name.startswith("_")
+            or theirs is ours
+            or not (inspect.isfunction(theirs) and inspect.isfunction(ours))
+        ):
+            continue
+        needed = list(inspect.signature(ours).parameters)
+        try:
+            inspect.signature(theirs).bind(*needed)
+        except TypeError as error:
+            return f"{entry.value} needs {name}({', '.join(needed)}): {error}"
+    return ""
 
 
 def _unsuitable_denoiser(entry: metadata.EntryPoint, loaded: Any) -> str:

@@ -109,6 +109,11 @@ def test_an_unknown_effect_is_refused_with_those_there_are_and_their_origin(
         ("lab_light:Stage", GLOW, "is not a class that extends acquire.sim.effects.base.Effect"),
         ("lab_light:Glow", GLOW.replace('"glow"]', '"glare"]'), r"needs kind: Literal\['glow'\]"),
         ("lab_light:Glow", GLOW.replace("def stages", "def steps"), "does not define stages"),
+        (
+            "lab_light:Glow",
+            GLOW.replace("(self, setting)", "(self)"),
+            r"needs stages\(self, setting\): too many",
+        ),
     ],
 )
 def test_a_broken_one_is_left_out_and_only_who_asks_for_it_is_refused(
