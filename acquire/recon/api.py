@@ -20,6 +20,7 @@ from acquire.recon.cycle import describe_cycle
 from acquire.recon.denoisers import open_denoiser
 from acquire.recon.description_check import DescriptionCheck, check_description
 from acquire.recon.error_estimation import RESERVED_ITERATIONS, estimate_error
+from acquire.recon.estimates import checked_answer
 from acquire.recon.feasibility import check_budget, least_seconds
 from acquire.recon.given import Given
 from acquire.recon.judge import frame_error, judge
@@ -199,8 +200,10 @@ class _Run:
         """The video with its quality, its estimated error and warnings."""
         segment, problem, clock = self.given.segment, self.given.problem, self.given.clock
         options, T_m = self.given.options, self.given.options.temporal_merge
-        predicted = estimate.predict()
-        video = self.in_scene_units(estimate.video())
+        predicted, dimensionless, facts = checked_answer(
+            options.solver, estimate, np.shape(problem.samples), self.given.video_shape
+        )
+        video = self.in_scene_units(dimensionless)
         held_out = estimate.held_out_error
         prediction = problem.prediction_error(predicted) if held_out is None else held_out
         quality = Quality(problem.misfit(predicted), prediction, problem.coverage, self.given.noise)
@@ -208,7 +211,6 @@ class _Run:
         # Whoever stops a run wants the answer now.
         check = check and options.static_image is None and clock.ended != "stopped"
         checked = check_description(segment, quality, clock) if check else DescriptionCheck()
-        facts = estimate.facts()
         one_hz = cosine_hz(segment.substep_ns * T_m, len(video))
         # Solvers without a band are free in every frame.
         whole = [(0, facts.get("temporal_coefficients", len(video)))]

@@ -8,8 +8,10 @@ from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 import numpy as np
 
 from acquire.arrays import host
+from acquire.errors import NumericsError, UsageError
 from acquire.recon.admm import Admm
 from acquire.recon.darkness import LitPixels
+from acquire.text import shown
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -38,6 +40,37 @@ class Estimate(Protocol):
     def facts(self) -> dict[str, Any]:
         """Return what a user may want to know of the solution, as JSON: `Reconstruction.parameters`."""
         ...
+
+
+def checked_answer(
+    solver: str, estimate: Estimate, lines_shape: tuple[int, ...], video_shape: tuple[int, ...]
+) -> tuple[NDArray[Any], NDArray[Any], dict[str, Any]]:
+    """Return the predicted lines, the video and the facts of an estimate.
+
+    Raises UsageError, with the solver's name, for what is not an estimate of that shape, and NumericsError
+    for numbers that are not finite.
+    """
+    if not all(hasattr(estimate, name) for name in ("held_out_error", "predict", "video", "facts")):
+        raise UsageError(
+            f"solver {solver} gave back {shown(estimate)}",
+            possible="an object with held_out_error, predict(), video() and facts()",
+        )
+    predicted = _checked(f"solver {solver}", "lines", estimate.predict(), lines_shape)
+    video = _checked(f"solver {solver}", "a video", estimate.video(), video_shape)
+    facts = estimate.facts()
+    if not isinstance(facts, dict):
+        raise UsageError(f"solver {solver} gave back {shown(facts)} as facts", possible="a dictionary")
+    return predicted, video, facts
+
+
+def _checked(solver: str, what: str, found: NDArray[Any], shape: tuple[int, ...]) -> NDArray[Any]:
+    if np.shape(found) != shape:
+        raise UsageError(f"{solver} gave back {what} of shape {np.shape(found)}", possible=f"shape {shape}")
+    if not np.isrealobj(found):
+        raise UsageError(f"{solver} gave back {what} of complex numbers", possible="real numbers")
+    if not np.isfinite(found).all():
+        raise NumericsError(f"{solver} gave back {what} with values that are not finite")
+    return found
 
 
 class ContinuingSolver(Protocol):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from typing import TYPE_CHECKING, Any, ClassVar, Literal, get_args
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 from pydantic import ValidationError
 
@@ -70,5 +70,5 @@ def preset_iterations(solver: str, preset: str) -> int:
     """Largest number of iterations of a preset. Raises UsageError for an unknown solver or preset."""
     counts: Mapping[str, int] = SOLVERS.load(solver).iterations
     if preset not in counts:
-        raise UsageError(f"preset {preset!r} is not known", possible=", ".join(get_args(Preset)))
+        raise UsageError(f"preset {preset!r} is not known to solver {solver}", possible=", ".join(counts))
     return counts[preset]

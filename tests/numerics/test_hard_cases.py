@@ -14,6 +14,7 @@ from acquire.geometry import Geometry
 from acquire.lines import Segment
 from acquire.recon import Reconstruction, reconstruct
 from acquire.recon.problem import MaskedOperator, build_problem
+from acquire.recon.solve import TwistSolver
 from acquire.recon.twist import Twist, TwistParameters
 
 GEOMETRY = Geometry(16, 3, 80)
@@ -217,6 +218,42 @@ def test_a_denoiser_of_another_shape_is_named(answer: object) -> None:
     with pytest.raises(UsageError, match="denoiser Wrong gave back") as refused:
         solve(segment(), denoiser=Wrong(answer))
     assert "same shape" in str(refused.value.possible)
+
+
+class Answer:
+    """What a solver of anybody's gives back: all right, but for what a test changes."""
+
+    held_out_error = None
+
+    def __init__(self, **changed: object) -> None:
+        self.changed = {"predict": CLEAN, "video": np.ones(GEOMETRY.video_shape(3, 1)), "facts": {}} | changed
+
+    def __getattr__(self, name: str) -> object:
+        return lambda: self.changed[name]
+
+
+@pytest.mark.parametrize(
+    ("answer", "told"),
+    [
+        (None, "gave back None"),
+        (Answer(facts=None), "gave back None as facts"),
+        (Answer(predict=np.zeros(3)), r"gave back lines of shape \(3,\)"),
+        (Answer(predict=CLEAN * np.nan), "gave back lines with values that are not finite"),
+        (Answer(video=np.ones((4, 8, 8))), r"gave back a video of shape \(4, 8, 8\)"),
+        (Answer(video=np.ones(GEOMETRY.video_shape(3, 1)) * 1j), "gave back a video of complex numbers"),
+        (
+            Answer(video=np.full(GEOMETRY.video_shape(3, 1), np.inf)),
+            "gave back a video with values that are not finite",
+        ),
+    ],
+)
+def test_a_wrong_answer_of_a_solver_is_refused_by_name(
+    monkeypatch: pytest.MonkeyPatch, answer: object, told: str
+) -> None:
+    """A video with a frame less was written, with the times of others."""
+    monkeypatch.setattr(TwistSolver, "solve", lambda *_: answer)
+    with pytest.raises((UsageError, NumericsError), match=f"solver twist {told}"):
+        solve(segment(), solver="twist")
 
 
 def test_a_denoiser_that_returns_nan_is_named() -> None:
