@@ -20,6 +20,7 @@ from acquire.lines import ARMS, LineBlock
 from acquire.pattern import Pattern
 from acquire.store import RecordingWriter
 from acquire.store.codecs import encode
+from acquire.store.plugin_codecs import prove
 from acquire.store.shape import crc32c
 from acquire.stream.ring import Ring, RingShape
 from acquire.stream.tagger import Tagger
@@ -81,12 +82,14 @@ class Parts:
 def measure_parts(load: Load, directory: Path) -> Parts:
     """Measure all parts, with a recording below ``directory`` that is removed afterwards.
 
-    Raises the same errors as creating a recording there would.
+    Raises the same errors as creating a recording there would, and ConfigError for a plug-in's codec that
+    does not give back what it packs.
     """
     patterns = [Pattern(arm, load.pixels, load.dtype, 255) for arm in ARMS]
     blocks = [
         pattern.lines(k * load.block_lines, load.block_lines) for k in range(_BLOCKS) for pattern in patterns
     ]
+    prove(blocks[0], load.codec)
 
     def pack(k: int) -> int:
         # With the checksum, which the recorder computes of every chunk that it encodes.

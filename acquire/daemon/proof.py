@@ -18,7 +18,7 @@ from acquire.capacity.parts import measure_parts
 from acquire.cores import usable_cores
 from acquire.daemon.messages import CapacityStatus
 from acquire.daemon.storage import choose_for
-from acquire.errors import StoreError, UsageError
+from acquire.errors import ConfigError, StoreError, UsageError
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -60,12 +60,16 @@ class Proof:
     ) -> CapacityStatus:
         """Return the sustained rate; ``fresh`` measures it again even if a recent result is valid.
 
-        Raises UsageError if it is below the configured rate, unless forced.
+        Raises UsageError if it is below the configured rate, unless forced, and ConfigError for a codec that
+        does not give back what it packs.
         """
         if fresh:
             self._chosen = self._measured = None
         try:
             parts = self._parts(progress)
+        # Recordings would be lost, however fast.
+        except ConfigError:
+            raise
         except (UsageError, StoreError) as error:
             log.warning("capacity: it cannot be measured: %s", error)
             rate_hz = self._config.passing_hz

@@ -16,6 +16,7 @@ import numpy as np
 from acquire.errors import ConfigError, UsageError
 from acquire.plugins import CODECS
 from acquire.store.shape import CRC_BYTES, PluginCodec, most_stored_bytes
+from acquire.text import shown
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -31,6 +32,10 @@ class EncodingError(OSError):
 def as_plugin(name: str, options: Any, line_bytes: int, item_bytes: int) -> PluginCodec:
     """Return a plug-in's codec as it is stored. ``options`` is its `CodecVariant`, for lines of any size."""
     fitted: CodecVariant = options.fitted(line_bytes, item_bytes)
+    if not isinstance(fitted, type(options)):
+        raise ConfigError(
+            f"codec {name!r}: fitted() gave back {shown(fitted)}", possible=f"a {type(options).__name__}"
+        )
     configuration = json.dumps(fitted.model_dump(mode="json"), sort_keys=True)
     (plugin,) = (each for each in CODECS.found() if each.name == name and not each.refused)
     return PluginCodec(name, fitted.zarr_name, configuration, plugin.distribution, plugin.version)
@@ -98,6 +103,26 @@ def decode(payload: memoryview, codec: PluginCodec, size: int) -> NDArray[np.uin
     if len(samples) != size:
         raise ValueError(f"codec {codec.name!r} has unpacked {len(samples)} bytes in place of {size}")
     return samples
+
+
+def prove(rows: NDArray[Any], codec: Codec) -> None:
+    """Raise ConfigError unless a plug-in's codec gives back rows of lines that it has packed.
+
+    What it does not give back would be missed when the scene is gone.
+    """
+    if not isinstance(codec, PluginCodec):
+        return
+    data = rows.reshape(-1).view(np.uint8)
+    try:
+        same = np.array_equal(decode(encode(data, codec).data, codec, len(data)), data)
+        why = "" if same else f"codec {codec.name!r} has unpacked other bytes than it was given"
+    except (EncodingError, ValueError) as error:
+        why = getattr(error, "strerror", None) or str(error)
+    if why:
+        raise ConfigError(
+            f"{codec.distribution} {codec.version} cannot pack lines: {why}",
+            hint="another recording.codec: lz4 and zstd are ours",
+        )
 
 
 def _failed(codec: PluginCodec, why: str) -> EncodingError:

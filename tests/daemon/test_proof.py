@@ -19,7 +19,7 @@ from acquire.daemon.plan import Run
 from acquire.daemon.proof import Proof
 from acquire.daemon.service import Service
 from acquire.daemon.states import State
-from acquire.errors import UsageError
+from acquire.errors import ConfigError, UsageError
 from acquire.rig import Rig
 from acquire.store import open_recording
 from acquire.stream.messages import Begin
@@ -58,6 +58,17 @@ def test_a_sufficient_rate_is_measured_once(measured: dict[str, Any], tmp_path: 
     time.sleep(0.001)
     assert (again := prove(force=False, fresh=True).measured) is not None
     assert again > whole[0].measured
+
+
+def test_a_codec_that_does_not_give_lines_back_is_no_lack_of_a_measurement(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    def measure(load: object, directory: Path) -> Parts:
+        raise ConfigError("codec 'lossy' has unpacked other bytes than it was given", hint="another")
+
+    monkeypatch.setattr(proof, "measure_parts", measure)
+    with pytest.raises(ConfigError, match="other bytes"):
+        make_proof(tmp_path)(force=True)
 
 
 def test_what_is_old_is_measured_again(

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import re
 import sys
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -20,7 +22,7 @@ from acquire.errors import ConfigError, DataError, UsageError
 from acquire.plugins import CODECS
 from acquire.store import RecordingWriter, RunCondition, open_recording, recover, verify
 from acquire.store.codecs import checked_size, configured_codec
-from acquire.store.plugin_codecs import as_plugin, variant_of
+from acquire.store.plugin_codecs import as_plugin, prove, variant_of
 from acquire.store.shape import PluginCodec, crc32c
 
 MODULE = """
@@ -215,6 +217,33 @@ def test_chunks_that_it_cannot_unpack_are_damaged(site: Site, path: Path, unpack
     site.install(source.format(fails=site.fails))
     with pytest.raises(DataError, match=f"lines 1000 to 1009 cannot be read: codec 'deflate' {why}"):
         open_recording(path).camera("a").read("lines", 0, 10)
+
+
+@pytest.mark.parametrize(
+    ("packs", "unpacks", "why"),
+    [
+        ("bytes(len(data))", "data", "codec 'deflate' has unpacked other bytes than it was given"),
+        ("None", "data", "codec 'deflate' of lab-codecs failed: TypeError"),
+        ("data", "1 // 0", "codec 'deflate' failed: ZeroDivisionError"),
+        ("data", "data[1:]", "codec 'deflate' has unpacked 511 bytes in place of 512"),
+    ],
+)
+def test_one_that_does_not_give_lines_back_is_refused_before_it_records(
+    site: Site, packs: str, unpacks: str, why: str
+) -> None:
+    """Its recordings were GOOD until somebody read them."""
+    prove(np.arange(256, dtype="<u2").reshape(-1, 8), deflate())
+    source = MODULE.format(fails=site.fails).replace("zlib.compress(data, self.level)", packs)
+    site.uninstall()
+    site.install(source.replace("zlib.decompress(data, bufsize=size)", unpacks))
+    with pytest.raises(ConfigError, match=re.escape(why)):
+        prove(np.arange(256, dtype="<u2").reshape(-1, 8), deflate())
+
+
+def test_one_that_is_fitted_to_nothing_is_refused(site: Site) -> None:
+    lost = SimpleNamespace(fitted=lambda line_bytes, item_bytes: None)
+    with pytest.raises(ConfigError, match=r"codec 'deflate': fitted\(\) gave back None"):
+        as_plugin("deflate", lost, 16, 2)
 
 
 def test_another_codec_of_that_name_does_not_unpack_its_lines(site: Site, path: Path) -> None:
