@@ -99,9 +99,11 @@ class Worker:
             self._child = nursery().fork(name, _main, theirs, name, target, *args)
         except (OSError, pickle.PicklingError, AttributeError, TypeError) as error:
             self.pipe.close()
+            busy = "fewer other programs on this host, or more memory"
+            local = "no lambda and no local class, such as a camera driver's opener: they cannot be sent"
             raise DeviceError(
                 f"{name}: the process cannot be started: {error}",
-                hint="fewer other programs on this host, or more memory",
+                hint=busy if isinstance(error, OSError) else local,
             ) from error
         finally:
             theirs.close()  # otherwise the pipe would not end with the child

@@ -108,6 +108,13 @@ def test_how_a_worker_ended_is_known() -> None:
         worker.end(deadline())
 
 
+def test_what_cannot_be_sent_to_a_worker_is_no_lack_of_memory() -> None:
+    """The opener of a plug-in's camera was a lambda, and the hint was to end other programs."""
+    with pytest.raises(DeviceError, match="cannot be started: Can't") as refused:
+        Worker("one", tell, lambda: None)
+    assert "lambda" in refused.value.hint
+
+
 def test_a_worker_that_is_killed_and_one_that_does_not_end() -> None:
     worker = Worker("one", tell)
     worker.expect(Ready, deadline())
