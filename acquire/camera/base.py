@@ -67,7 +67,10 @@ class Camera(Protocol):
         ...
 
     def settings(self) -> dict[str, Any]:
-        """Return the settings as read back from the camera, under their SFNC names."""
+        """Return the settings as read back from the camera, under their SFNC names.
+
+        They are facts for JSON (no numbers of numpy), at least ``Width`` and ``PixelFormat``.
+        """
         ...
 
     def arm(self) -> None:
@@ -75,7 +78,10 @@ class Camera(Protocol):
         ...
 
     def next_block(self, timeout_s: float) -> CameraBlock | None:
-        """Return the next lines, or None if none came within ``timeout_s``."""
+        """Return the next lines, or None if none came within ``timeout_s``.
+
+        Raises CameraError ("not armed") if it is not armed.
+        """
         ...
 
     def release(self, block: CameraBlock) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import json
 import pickle
 import signal
 import time
@@ -66,6 +67,7 @@ class CameraContract:
         assert stand.serial in identity.serial
         assert settings["Width"] >= 1
         assert settings["PixelFormat"].startswith("Mono")
+        json.dumps(settings)  # a recording's attributes: numbers of numpy are refused when it begins
 
     def test_a_camera_that_is_not_armed_gives_no_lines(self, camera: Camera) -> None:
         """A wait that could only time out is an error of the caller."""

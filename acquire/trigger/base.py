@@ -105,7 +105,10 @@ class Trigger(Protocol):
         ...
 
     def prepare(self, run: TriggerRun) -> None:
-        """Load code and timing; raise TriggerError if they are not supported. The light stays off."""
+        """Load code and timing; raise TriggerError if they are not supported. The light stays off.
+
+        While a run goes on, the same run again changes nothing, and another is refused.
+        """
         ...
 
     def start(self) -> ClockFit:
@@ -113,7 +116,10 @@ class Trigger(Protocol):
         ...
 
     def tags(self, timeout_s: float) -> list[LineTag]:
-        """Return the tags since the last call, in order; wait at most ``timeout_s`` for the first."""
+        """Return the tags since the last call, in order; wait at most ``timeout_s`` for the first.
+
+        It is called by a thread of its own, whose wait `stop` ends.
+        """
         ...
 
     def events(self) -> list[TagEvent]:
