@@ -92,7 +92,7 @@ def run(words: Sequence[str]) -> int:
         if type(error).__name__ == "NoArgsIsHelpError":
             say_lines(error.format_message(), err=True)  # type: ignore[attr-defined]
             return UsageError.exit_code
-        raise _usage_error(error) from error
+        raise _usage_error(error, f"acquire {first}") from error
     return code if isinstance(code, int) else 0
 
 
@@ -136,10 +136,11 @@ def not_installed(error: ModuleNotFoundError) -> UsageError:
     )
 
 
-def _usage_error(error: Any) -> UsageError:
+def _usage_error(error: Any, command: str) -> UsageError:
     """Rewrite one of click's errors in our own style: the command, the mistake, and where to find help."""
     context, near = getattr(error, "ctx", None), getattr(error, "possibilities", None)
-    command = context.command_path if context is not None else "acquire"
+    # click's parser does not say whose option lacks its value
+    command = context.command_path if context is not None else command
     where = f"{command.removeprefix('acquire').lstrip()}: ".removeprefix(": ")
     message = own_words(error.message if near else error.format_message())
     # What was probably meant is added below, in our own words.

@@ -98,6 +98,14 @@ def test_wrong_arguments_are_reported_like_all_errors(
     assert (error["kind"], error["exit_code"], error["hint"]) == ("UsageError", 2, f"{command} --help")
 
 
+def test_an_option_without_its_value_is_reported_with_its_command(cli: Cli) -> None:
+    told = cli("start", "take.zarr", "--post").err.splitlines()
+    assert told == [
+        "acquire: error: start: option '--post' requires an argument",
+        "  try: acquire start --help",
+    ]
+
+
 def test_text_wider_than_the_terminal_is_wrapped_between_words(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
