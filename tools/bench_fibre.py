@@ -26,7 +26,8 @@ from acquire.config import load_rig, load_scene
 from acquire.config.scene import SceneFile
 from acquire.recon.segments import Voxels
 from acquire.reconstruct import Monitor, Options, by_lines, combine, in_tiles, in_voxels, open_pool
-from acquire.sim.procedural import Canvas, still
+from acquire.sim.canvas import Canvas
+from acquire.sim.procedural import still
 from acquire.sim.scene import frames_at
 from acquire.sim.scenes import build_scene
 from acquire.simulate import bench_of, simulate

@@ -28,7 +28,8 @@ from acquire.calibrate.target import tile_alignments
 from acquire.config import load_rig
 from acquire.config.scene import SceneFile
 from acquire.recon import reconstruct
-from acquire.sim.procedural import Canvas, still
+from acquire.sim.canvas import Canvas
+from acquire.sim.procedural import still
 from acquire.simulate import simulate
 
 ROWS, COLUMNS, STAGES, LINES, SHOWN, RIM = 128, 192, 64, 1024, 300, 6

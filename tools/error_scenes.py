@@ -28,7 +28,8 @@ from acquire.codes import mix_seed, prbs
 from acquire.config import load_scene
 from acquire.forward import DualArm
 from acquire.geometry import Geometry
-from acquire.sim.procedural import SUBSTEP_HZ, CameraNoise, Canvas, Recorded, expose
+from acquire.sim.canvas import Canvas
+from acquire.sim.procedural import SUBSTEP_HZ, CameraNoise, Recorded, expose
 from acquire.sim.scenes import build_scene
 from acquire.sim.voxels import truth
 

@@ -10,7 +10,8 @@ from pathlib import Path
 
 import numpy as np
 
-from acquire.sim.procedural import CLEAN, SCENES, CameraNoise, Canvas, Recorded, expose, light, record
+from acquire.sim.canvas import Canvas
+from acquire.sim.procedural import CLEAN, SCENES, CameraNoise, Recorded, expose, light, record
 
 __all__ = ["CLEAN", "SCENES", "CameraNoise", "Canvas", "Recorded", "expose", "light", "record"]
 

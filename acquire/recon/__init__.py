@@ -16,8 +16,8 @@
                     └─ blinking          cosines: bandwidth, lamps, pursuit
                         └─ patterns      with curves; evidence, settling, darkness; beside_motion,
                                          joined
-    iterations     admm                  sign, tv, volume, smooth, ground, drift, rotation, denoisers,
-                                         kernels: proximal steps
+    iterations     admm                  sign, tv, volume, smooth, ground, drift, bends, rotation,
+                                         denoisers, kernels: proximal steps
                     │
     judgement      estimates             what any solver returns
                     ├─ judge             residuals and warnings; sanity, aliasing, unseen

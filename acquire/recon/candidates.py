@@ -46,7 +46,7 @@ class Candidate:
     ``ground`` is the weight of a still ground behind a volume, relative to that of the volume; 0 is none.
     ``brightness``: times a free brightness of the whole scene; ``change``: the difference from the best
     still; ``fine``: solved at N_m = 1, then merged; ``robust``: samples with large residuals have less
-    weight. ``drift`` is the velocity of a volume's contents and ``rotation`` their turn, see `VolumeTv`;
+    weight. ``drift`` is the path of a volume's contents and ``rotation`` their turn, see `VolumeTv`;
     () is none. ``speed_changes`` are those of a cycle, or of these. ``learned``: the spectrum of a smooth
     volume is learned from the lines, beginning with this weight and pace (`spectrum`).
     """

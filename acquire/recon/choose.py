@@ -23,6 +23,7 @@ import numpy as np
 
 from acquire.arrays import host
 from acquire.recon.basis import LearnedBasis
+from acquire.recon.bends import drifting
 from acquire.recon.blinking import (
     AT_REST,
     FIRST_LOOK_SHARE,
@@ -45,7 +46,7 @@ from acquire.recon.candidates import (
     VOLUME,
 )
 from acquire.recon.cycle import TRIED_CHANGES, find_period
-from acquire.recon.drift import drifting
+from acquire.recon.drift import fastest
 from acquire.recon.estimates import Preferred, Refined
 from acquire.recon.given import Given
 from acquire.recon.holdout import HeldOut
@@ -106,8 +107,8 @@ is a candidate: a video that repeats itself claims more than any other. Motion t
 text that scrolls 0.9."""
 FOLLOWED = 0.95
 """Largest error of a volume that follows what moves, relative to one at rest after as many iterations, for
-which it goes on: text, bodies that cross the field and wheels have 0.5 to 0.94, and a splash, whose picture
-would be 1.3 dB worse, 0.96."""
+which it goes on: text, bodies that cross the field, balls, pendulums and wheels have 0.5 to 0.94, and a
+splash, whose picture would be 1.0 to 1.3 dB worse, 0.953 and 0.96."""
 CLOSE, NOT_FAR = 1.1, 2.0
 """Largest error of the cosines, relative to the best trial's, for which they are continued, and for which
 they are if clear patterns were found, or if only a glance was taken."""
@@ -352,6 +353,8 @@ def _best_volume(bench: Workbench, tried: _Tried, rival: float) -> Trial:
     calm = bench.attempt(bench.fitting(CALM), FIRST_ITERATIONS, tried.plain)
     grounded = bench.attempt(bench.fitting(GROUNDED), FIRST_ITERATIONS)
     volume = min(tried.volume, calm, grounded, key=_error)
+    if volume is tried.volume and tried.smooth is not None:
+        return volume  # what moves in it was looked for
     # The motion may show in a better video, though not in the first.
     return _following(volume, rival) or volume
 
@@ -365,9 +368,9 @@ def _following(volume: Trial, rival: float) -> Trial | None:
             best = _on_path(volume, candidate, rival)
             if best.error <= FOLLOWED * volume.error:
                 # The rim of a picture whose sides are 1 moves by π turns.
-                sides = [np.pi * abs(turn) for turn in candidate.rotation[:1]] or map(abs, candidate.drift)
+                turns = [np.pi * abs(turn) for turn in candidate.rotation[:1]]
                 outdone = rival < OUTDONE * best.error
-                volume = found = best if outdone else _along(best, max(sides))
+                volume = found = best if outdone else _along(best, *turns or [fastest(candidate.drift)])
     return found
 
 

@@ -1,6 +1,7 @@
 """What moves across the picture as one: found in a first video, and followed by a volume.
 
     x(t, r) = y(t, r − v·t)        y hardly changes; v in sides of the picture over the range
+    x(t, r) = y(t, r − d(t))       on a path that bends (`bends`)
 
 Total variation of a volume counts how far its contents move between two instants, so that a weight that holds
 back the noise keeps fast texture from moving. Of y, which moves along, it counts what changes besides. Text
@@ -13,23 +14,20 @@ first video whose edges are still smeared.
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.polynomial.legendre import legvander
 from scipy.optimize import minimize
 
-from acquire.arrays import host, namespace
-from acquire.recon.basis import TemporalBasis
+from acquire.arrays import namespace
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from numpy.typing import NDArray
+    from numpy.typing import ArrayLike, NDArray
 
     from acquire.arrays import Array
-    from acquire.recon.candidates import Candidate
-    from acquire.recon.workbench import Trial
 
 WAVES = 10
 """Highest waves across the picture that are compared: finer ones are smeared in a first video."""
@@ -46,18 +44,10 @@ RISE, STEEPEST, WORTH_A_RISE = 0.1, 0.6, 1.01
 the share that adds up for which the speed is not constant."""
 REFINEMENTS = 120
 """Largest number of steps from the best velocity of the grid to a better one."""
+FINELY = 100
+"""Number of instants between which the fastest motion on a path is looked for."""
 ROUNDING = 1e-9
 """Share of a video's energy below which its changes are rounding."""
-
-
-def drifting(trial: Trial) -> Candidate | None:
-    """Return a trial's candidate that follows what moves in its video; None if nothing moves as one."""
-    count = trial.basis.count
-    instants = TemporalBasis(count, count, trial.bench.problem.arrays).synthesize(trial.coefficients)
-    found = find_drift(host(instants))
-    if found is None:
-        return None
-    return replace(trial.candidate, drift=found[:2], speed_changes=found[2:], rotation=())
 
 
 def find_drift(instants: NDArray[Any]) -> tuple[float, ...] | None:
@@ -66,44 +56,99 @@ def find_drift(instants: NDArray[Any]) -> tuple[float, ...] | None:
     In sides of the picture over the video's duration. If the speed changes, its rise from the mean to the
     end, relative to the mean, follows. What never changes does not count.
     """
-    count, side, _ = instants.shape
+    count = len(instants)
+    waves = Waves(instants)
     # Of fewer instants, neighbours might be a whole wave apart, which looks like standing still.
-    if count < FASTEST * WAVES:
+    if count < FASTEST * WAVES or waves.at_rest:
         return None
-    changes = instants - instants.mean(axis=0)
-    if np.square(changes).sum() <= ROUNDING * np.square(instants).sum():
-        return None
-    # Half of a real picture's waves are the other half's conjugates.
-    f, g = np.fft.fftfreq(side, 1 / side), np.fft.rfftfreq(side, 1 / side)
-    down, across = np.flatnonzero(abs(f) <= WAVES), np.flatnonzero(g <= WAVES)
-    twice = np.where(across > 0, 2.0, 1.0)  # so that these count for both
-    waves = np.fft.rfft2(changes)[:, down[:, None], across]
-    total = max(count * float((np.square(abs(waves)) * twice).sum()), np.finfo(np.float64).tiny)
     v = np.arange(-FASTEST, FASTEST + 1e-9, 1 / (2 * WAVES))
     turns = 2j * np.pi * moments(count)[:, None, None] * v[:, None]  # (instant, velocity, wave)
-    by_rows, by_columns = np.exp(turns * f[down]), np.exp(turns * g[across]).transpose(2, 1, 0)
+    by_rows, by_columns = np.exp(turns * waves.down), np.exp(turns * waves.across).transpose(2, 1, 0)
     shares, coherent = np.empty((2, len(v), len(v)))
     for row in range(len(v)):
         back = by_rows[:, row]
-        added = by_columns @ (waves * back[:, :, None]).transpose(2, 0, 1)  # (wave, velocity, wave)
+        turned = waves.amplitudes * back[:, :, None]
+        added = by_columns @ turned.transpose(2, 0, 1)  # (wave, velocity, wave)
         power = np.square(abs(added))
-        shares[row] = power.sum(axis=2).T @ twice / total
+        shares[row] = power.sum(axis=2).T @ waves.weights
         # The mean over time, which is subtracted, holds a part of a wave that turns slowly. Without it, the
         # peak is at too fast a velocity.
         left = np.maximum(1 - np.square(abs(by_columns @ back / count)), LEAST_LEFT)
-        coherent[row] = (power / left).sum(axis=2).T @ twice / total
+        coherent[row] = (power / left).sum(axis=2).T @ waves.weights
     peak = np.unravel_index(int(coherent.argmax()), coherent.shape)
     if shares[peak] < COHERENT:
         return None
 
     def share(x: NDArray[np.float64]) -> float:
-        moved = moments(count, x[2])[:, None, None] * (x[0] * f[down][:, None] + x[1] * g[across])
-        back = np.exp(2j * np.pi * moved)
-        power = np.square(abs((waves * back).sum(axis=0)))
-        left = np.maximum(1 - np.square(abs(back.mean(axis=0))), LEAST_LEFT)
-        return float(np.sum(power / left @ twice) / total)
+        return waves.share(displacements(x[:2], count, x[2]))
 
     return refined(share, np.array([v[peak[0]], v[peak[1]]]), np.full(2, 1 / (4 * WAVES)))
+
+
+class Waves:
+    """The lowest waves of what changes in a video (K, n, n), which add up if they are moved back on its path.
+
+    ``amplitudes`` (K, down, across) are those of so many waves ``down`` and ``across`` the picture, and
+    ``weights`` make a sum over the latter a share of all the changing light.
+    """
+
+    def __init__(self, instants: NDArray[Any]) -> None:
+        count, side, _ = instants.shape
+        changes = instants - instants.mean(axis=0)
+        self.at_rest = bool(np.square(changes).sum() <= ROUNDING * np.square(instants).sum())
+        # Half of a real picture's waves are the other half's conjugates.
+        f, g = np.fft.fftfreq(side, 1 / side), np.fft.rfftfreq(side, 1 / side)
+        down, across = np.flatnonzero(abs(f) <= WAVES), np.flatnonzero(g <= WAVES)
+        self.down, self.across = f[down], g[across]
+        self.amplitudes = np.fft.rfft2(changes)[:, down[:, None], across]
+        twice = np.where(across > 0, 2.0, 1.0)  # so that these count for both
+        total = count * float((np.square(abs(self.amplitudes)) * twice).sum())
+        self.weights = twice / max(total, np.finfo(np.float64).tiny)
+
+    def turns(self, by: NDArray[np.float64]) -> NDArray[np.complex128]:
+        """What moves the waves of each instant back by this much (…, 2), in sides of the picture."""
+        rows, columns = by[..., :1, None], by[..., 1:, None]
+        return np.asarray(np.exp(2j * np.pi * (rows * self.down[:, None] + columns * self.across)))
+
+    def share(self, by: NDArray[np.float64]) -> float:
+        """The share of the changing light that adds up if the instants are moved back by this much (K, 2).
+
+        What the mean over time holds of a wave counts as well, since it is part of what moves.
+        """
+        turns = self.turns(by)
+        power = np.square(abs((self.amplitudes * turns).sum(axis=0)))
+        left = np.maximum(1 - np.square(abs(turns.mean(axis=0))), LEAST_LEFT)
+        return float(np.sum(power / left @ self.weights))
+
+    def slope(self, by: NDArray[np.float64]) -> NDArray[np.float64]:
+        """The derivative of `share` by each displacement (K, 2)."""
+        turns = self.turns(by)
+        moved, mean = self.amplitudes * turns, turns.mean(axis=0)
+        added, left = moved.sum(axis=0), 1 - np.square(abs(mean))
+        # By the phases of the waves, of which displacements are multiples: of the power, and of what is left.
+        of_power = 2 * np.real(1j * moved * added.conj())
+        of_left = np.where(left > LEAST_LEFT, -2 * np.real(1j * turns * mean.conj()) / len(by), 0)
+        left = np.maximum(left, LEAST_LEFT)
+        by_phase = (of_power - of_left * np.square(abs(added)) / left) / left * self.weights
+        rows = (by_phase * self.down[:, None]).sum(axis=(1, 2))
+        columns = (by_phase * self.across).sum(axis=(1, 2))
+        return np.asarray(2 * np.pi * np.stack([rows, columns], axis=1))
+
+
+def displacements(drift: ArrayLike, count: int, rise: float = 0.0) -> NDArray[np.float64]:
+    """How far what drifts has come at each of ``count`` instants (K, 2), in sides of the picture.
+
+    ``drift`` is its velocity (rows, columns) and, for a path that bends, such pairs of coefficients of
+    Legendre's polynomials P₂, P₃, … over the range.
+    """
+    t, pairs = moments(count, rise), np.reshape(np.asarray(drift, np.float64), (-1, 2))
+    bends = legvander(2 * moments(count), len(pairs))[:, 2:]
+    return np.asarray(np.outer(t, pairs[0]) + bends @ pairs[1:])
+
+
+def fastest(drift: ArrayLike) -> float:
+    """The largest velocity on a path, as `displacements` takes it, in sides of the picture over the range."""
+    return float(abs(np.diff(displacements(drift, FINELY), axis=0)).max() * FINELY)
 
 
 def moments(count: int, rise: float = 0.0) -> NDArray[np.float64]:
@@ -166,10 +211,9 @@ class Path:
     def __init__(
         self, drift: tuple[float, ...], count: int, side: int, like: Array, rise: float = 0.0
     ) -> None:
-        xp, t = namespace(like), moments(count, rise)
+        xp, by = namespace(like), displacements(drift, count, rise)
         self._turns = [
-            xp.asarray(_shifts(side, velocity * side * t), dtype=like.dtype, device=like.device)
-            for velocity in drift
+            xp.asarray(_shifts(side, each * side), dtype=like.dtype, device=like.device) for each in by.T
         ]
 
     def follow(self, x: Array) -> Array:

@@ -39,9 +39,10 @@ class Choice:
 
     ``prior`` is that of a candidate, or `COSINES_PRIOR`, of which only the number is handed over.
     ``brightness`` is the number of cosines of the whole scene's brightness, 0 if that is constant,
-    ``period_frames`` that of a cycle, ``drift`` a volume's velocity in sides of the picture per frame, and
-    ``rotation`` a cycle's turn, or a volume's with its turns per frame; the next part fits them to its lines,
-    and it learns a spectrum of its own if that of a smooth volume was ``learned``.
+    ``period_frames`` that of a cycle, ``drift`` a volume's velocity in sides of the picture per frame
+    (without the bends of its path, which are of that part only), and ``rotation`` a cycle's turn, or a
+    volume's with its turns per frame; the next part fits them to its lines, and it learns a spectrum of its
+    own if that of a smooth volume was ``learned``.
     """
 
     prior: str
@@ -82,7 +83,7 @@ class Choice:
             fine=bool(found.get("fine")),
             period_frames=found.get("period_frames", 0.0),
             ground=found.get("ground", 0.0),
-            drift=tuple(each / len(result.video) for each in found.get("drift", ())),
+            drift=tuple(each / len(result.video) for each in found.get("drift", ())[:2]),
             rotation=_times_turns(per_frame, found.get("rotation", ())),
             learned=bool(found.get("learned")),
         )

@@ -36,8 +36,9 @@ class VolumeTv:
     """Isotropic 3-D TV of the first K cosines' volume on K instants, as a denoiser of their coefficients.
 
     If it is ``cyclic``, the coefficients are those of a `CyclicBasis`, and the instants those of one cycle.
-    ``drift`` is the velocity (rows, columns) of the volume's contents in sides of the picture over all
-    instants, and ``rotation`` their turn, see `Rotation`, along which changes are counted; () is none.
+    ``drift`` is the path of the volume's contents in sides of the picture over all instants, see
+    `drift.displacements`, and ``rotation`` their turn, see `Rotation`, along which changes are counted; () is
+    none.
     ``rise`` is that of the speed from its mean to the end, relative to the mean.
     The transform between coefficients and instants is orthonormal, so that the prox of one is the prox of the
     other. ``prox`` is approximate: ``iterations`` of fast gradient projection (Beck and Teboulle, IEEE

@@ -18,11 +18,11 @@ from acquire.forward import merge_video
 from acquire.recon.admm import Admm
 from acquire.recon.band import segment_operator
 from acquire.recon.basis import CyclicBasis, TemporalBasis, resized
+from acquire.recon.bends import drifting
 from acquire.recon.brightness import fit_brightness
 from acquire.recon.candidates import CALM, CYCLE, USUAL_ENERGY, VOLUME, Candidate, parameters
 from acquire.recon.chosen import ChosenEstimate
 from acquire.recon.cycle import FEWEST_HARMONICS, better_speed, most_harmonics
-from acquire.recon.drift import drifting
 from acquire.recon.rotation import turning
 from acquire.recon.volume import VolumeTv
 

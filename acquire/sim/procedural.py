@@ -20,6 +20,8 @@
     wheel     a textured wheel turns beside the middle before textured ground
     waves     waves on deep water, which run in all directions
     smoke     smooth texture is stirred by vortices and drifts
+    ball      a bright ball is thrown, falls and bounces before a textured still
+    pendulum  a bright bob swings on a dark rod before a textured still
 
 Sizes are fractions of the picture and times fractions of the span, so that a scene is the same at any M, S
 and L_R; only the lamps have frequencies in sub-steps. The noise is that of a 12-bit camera whose brightest
@@ -29,7 +31,6 @@ sample is ``full_well_e`` electrons.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -43,6 +44,7 @@ from acquire.forward import DualArm, merge_video
 from acquire.geometry import Geometry
 from acquire.lines import Segment
 from acquire.noise import Noise
+from acquire.sim.canvas import Canvas
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -85,50 +87,6 @@ class Recorded:
         """Return the voxels that a reconstruction should find, for the trusted frames."""
         video = merge_video(self.light, spatial_merge, temporal_merge)
         return np.asarray(video[self.segment.geometry.trusted_frames(temporal_merge)], np.float32)
-
-
-class Canvas:
-    """Coordinates (0 to 1) and random texture of an n × n picture, on which a scene is drawn."""
-
-    def __init__(self, n: int, span: int, seed: int) -> None:
-        self.n, self.span, self.rng = n, span, np.random.default_rng(seed)
-        self.y, self.x = np.meshgrid(*[(np.arange(n) + 0.5) / n] * 2, indexing="ij")
-
-    def texture(self, *scales: float) -> Image:
-        """Return smooth noise of several scales (fractions of the picture), from 0 to 1."""
-        total = sum(
-            # the wider noise is smoothed, the weaker it is: the factor makes all scales alike
-            gaussian_filter(self.rng.standard_normal((self.n, self.n)), scale * self.n, mode="wrap") * scale
-            for scale in scales
-        )
-        # quantiles, so that single bright or dark grains do not take the contrast
-        low, high = np.quantile(np.asarray(total), [0.01, 0.99])
-        return np.asarray(np.clip((total - low) / (high - low), 0, 1), np.float32)
-
-    def inside(self, distance: Any) -> Image:
-        """Return 1 where a signed distance (fractions of the picture) is negative, with a one-pixel edge."""
-        return np.asarray(np.clip(0.5 - distance * self.n, 0, 1), np.float32)
-
-    def ball(self, y: float, x: float, radius: float) -> Image:
-        """Return a disc with the centre (y, x)."""
-        return self.inside(np.hypot(self.y - y, self.x - x) - radius)
-
-    def box(self, y: float, x: float, height: float, width: float) -> Image:
-        """Return a rectangle with the centre (y, x)."""
-        return self.inside(np.maximum(abs(self.y - y) - height / 2, abs(self.x - x) - width / 2))
-
-    def limb(self, y: float, x: float, angle: float, length: float, width: float) -> Image:
-        """Return a rounded stroke that starts at (y, x), at ``angle`` from straight down."""
-        dy, dx = self.y - y, self.x - x
-        along = np.clip(dy * np.cos(angle) + dx * np.sin(angle), 0, length)
-        return self.inside(np.hypot(dy - along * np.cos(angle), dx - along * np.sin(angle)) - width / 2)
-
-    @cached_property
-    def ground(self) -> Image:
-        """A texture for the background."""
-        # drawn when it is first used, after a scene's own numbers: in another order they would be other
-        # scenes
-        return np.asarray(0.35 + 0.65 * self.texture(0.008, 0.03, 0.1))
 
 
 def _over(ground: Image, mask: Image, value: float | Image) -> Image:
@@ -403,6 +361,29 @@ def smoke(s: Canvas) -> Callable[[int, float], Image]:
     return frame
 
 
+def ball(s: Canvas) -> Callable[[int, float], Image]:
+    """A thrown ball that falls and bounces two or three times."""
+    begin, across, bounces = s.rng.uniform([0.15, 0.25, 1.8], [0.35, 0.5, 2.8])
+
+    def frame(_t: int, tau: float) -> Image:
+        u = bounces * tau % 1
+        return _over(s.ground, s.ball(0.8 - 2 * u * (1 - u), begin + across * tau, 0.07), 0.95)
+
+    return frame
+
+
+def pendulum(s: Canvas) -> Callable[[int, float], Image]:
+    """A bob that swings about once, on a rod."""
+    swings, phase = s.rng.uniform([0.8, 0.0], [1.6, 2 * np.pi])
+
+    def frame(_t: int, tau: float) -> Image:
+        angle = 0.6 * np.sin(2 * np.pi * swings * tau + phase)
+        rod = _over(0.7 * s.ground, s.limb(0.15, 0.5, angle, 0.55, 0.02), 0.05)
+        return _over(rod, s.ball(0.15 + 0.55 * np.cos(angle), 0.5 + 0.55 * np.sin(angle), 0.08), 1.0)
+
+    return frame
+
+
 SCENES = {
     f.__name__: f
     for f in (
@@ -426,6 +407,8 @@ SCENES = {
         wheel,
         waves,
         smoke,
+        ball,
+        pendulum,
     )
 }
 

@@ -1,0 +1,145 @@
+"""What moves across the picture as one on a path that bends: found in a first video, and followed as a drift.
+
+    x(t, r) = y(t, r − d(t))       d(t) = v·t + Σ cₖ·Pₖ(t), k = 2, 3, …, with Legendre's polynomials Pₖ
+
+Balls fall, bounce and swing. No velocity lets what they show add up, but a path does, and it can be read off
+a first video: where each instant matches best what those before it show. That path is then made smooth, and
+the one near it found along which the most adds up.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.polynomial.legendre import legvander
+from scipy.optimize import minimize
+
+from acquire.arrays import host
+from acquire.recon.basis import TemporalBasis
+from acquire.recon.drift import COHERENT, Waves, displacements, find_drift
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from acquire.recon.candidates import Candidate
+    from acquire.recon.workbench import Trial
+
+    Path = tuple[float, ...]
+
+ORDERS = (3, 8)
+"""Highest polynomials of a path: one that speeds up or falls takes 2 or 3, and one that turns back 8."""
+WORTH_BENDING, WORTH_MORE = 1.2, 1.05
+"""Least gain of the share that adds up for which a path bends, and for which it takes the higher polynomials.
+Where it does bend, the share grows by 1.35 to 2.4, and for text and bodies that cross the field, in whose
+errors a path can bend, by 1.02 to 1.12. A splash seems to move on such a path as well: there, the held-out
+samples decide."""
+SHARPEST = 4.0
+"""Largest change of the velocity between two instants of a first path, in sides over the range."""
+PLACES = 64
+"""Number of places along each side in which an instant is looked for."""
+STEPS = 60
+"""Largest number of steps to the best path."""
+
+
+def drifting(trial: Trial) -> Candidate | None:
+    """Return a trial's candidate that follows what moves in its video; None if nothing moves as one."""
+    count, drift = trial.basis.count, trial.candidate.drift
+    basis = TemporalBasis(count, count, trial.bench.problem.arrays)
+    instants = host(basis.synthesize(trial.coefficients))
+    bent = drift if len(drift) > 2 else None  # a video on such a path shows no velocity
+    straight = None if bent else find_drift(instants)
+    found = find_bends(instants, straight, bent)
+    if found is not None:
+        return replace(trial.candidate, drift=found, speed_changes=(), rotation=())
+    if straight is None:
+        return None
+    return replace(trial.candidate, drift=straight[:2], speed_changes=straight[2:], rotation=())
+
+
+def find_bends(instants: NDArray[Any], straight: Path | None, bent: Path | None = None) -> Path | None:
+    """Return the path of what moves in a video (K, n, n), as `drift.displacements` takes it.
+
+    It has to let much more add up than the ``straight`` one, or than `COHERENT` if there is none; None if no
+    path does. With one that is ``bent``, it is the best one near that.
+    """
+    count, waves = len(instants), Waves(instants)
+    if count <= 2 * ORDERS[-1] or waves.at_rest:
+        return bent
+    if bent is not None:
+        near = _nearby(waves, bent, len(bent) // 2)
+        if len(bent) == 2 * ORDERS[-1]:
+            return near
+        more = _nearby(waves, near, ORDERS[-1])
+        return more if _share(waves, more) > WORTH_MORE * _share(waves, near) else near
+    least: float = COHERENT
+    starts: list[tuple[Path, int]] = []
+    if straight is not None:
+        least = waves.share(displacements(straight[:2], count, *straight[2:]))
+        starts.append((straight[:2], ORDERS[0]))
+    tracked = _tracked(waves)
+    if waves.share(tracked) > least:
+        design = np.column_stack([np.ones(count), _polynomials(count, ORDERS[-1])])
+        smooth = np.linalg.lstsq(design, tracked, rcond=None)[0][1:]
+        starts.append((tuple(smooth.ravel()), ORDERS[-1]))
+    best: Path | None = None
+    least *= WORTH_BENDING
+    for start, order in starts:
+        found = _nearby(waves, start, order)
+        if (share := _share(waves, found)) > least:
+            best, least = found, WORTH_MORE * share
+    return best
+
+
+def _share(waves: Waves, path: Path) -> float:
+    return waves.share(displacements(path, len(waves.amplitudes)))
+
+
+def _polynomials(count: int, order: int) -> NDArray[np.float64]:
+    """What the coefficients of a path are multiplied by at each instant (K, order)."""
+    t = (np.arange(count) + 0.5) / count - 0.5
+    return np.column_stack([t, legvander(2 * t, order)[:, 2:]])
+
+
+def _nearby(waves: Waves, start: Path, order: int) -> Path:
+    """The path near ``start``, up to a polynomial, along which the most adds up."""
+    first, powers = np.zeros((order, 2)), _polynomials(len(waves.amplitudes), order)
+    known = np.reshape(start, (-1, 2))[:order]
+    first[: len(known)] = known
+
+    def missed(x: NDArray[np.float64]) -> tuple[float, NDArray[np.float64]]:
+        by = powers @ x.reshape(order, 2)
+        return -waves.share(by), -(powers.T @ waves.slope(by)).ravel()
+
+    found = minimize(missed, first.ravel(), jac=True, method="L-BFGS-B", options={"maxiter": STEPS})
+    return tuple(map(float, found.x))
+
+
+def _tracked(waves: Waves) -> NDArray[np.float64]:
+    """Where each instant (K, 2) matches best the sum of those from the first on that is looked for.
+
+    That is one of three, of which one may not show what moves.
+    """
+    count = len(waves.amplitudes)
+    paths = [_tracked_from(waves, first) for first in (count // 4, count // 2, 3 * count // 4)]
+    return max(paths, key=waves.share)
+
+
+def _tracked_from(waves: Waves, first: int) -> NDArray[np.float64]:
+    amplitudes, count = waves.amplitudes, len(waves.amplitudes)
+    by, places = np.zeros((count, 2)), np.arange(PLACES) / PLACES
+    rows = np.exp(2j * np.pi * places[:, None] * waves.down)
+    columns = np.exp(2j * np.pi * places[:, None] * waves.across) * waves.weights
+    for way in (1, -1):
+        seen, step = amplitudes[first].copy(), np.zeros(2)
+        for k in range(first + way, count if way > 0 else -1, way):
+            expected = by[k - way] + step
+            match = (rows @ (amplitudes[k] * seen.conj()) @ columns.T).real
+            down, right = ((places - each + 0.5) % 1 - 0.5 for each in expected)
+            near = abs(np.stack(np.meshgrid(down, right, indexing="ij"))).max(axis=0) <= SHARPEST / count
+            row, column = np.unravel_index(np.where(near, match, -np.inf).argmax(), match.shape)
+            by[k] = expected + np.array([down[row], right[column]])
+            step = by[k] - by[k - way]
+            seen += amplitudes[k] * waves.turns(by[k])
+    return by
