@@ -18,7 +18,7 @@ from scipy.optimize import minimize
 
 from acquire.arrays import host
 from acquire.recon.basis import TemporalBasis
-from acquire.recon.drift import COHERENT, Waves, displacements, find_drift
+from acquire.recon.drift import Waves, displacements, find_drift
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -35,6 +35,9 @@ WORTH_BENDING, WORTH_MORE = 1.2, 1.05
 Where it does bend, the share grows by 1.35 to 2.4, and for text and bodies that cross the field, in whose
 errors a path can bend, by 1.02 to 1.12. A splash seems to move on such a path as well: there, the held-out
 samples decide."""
+ADDS_UP = 0.25
+"""Share of the changing light that has to add up on a path in whose place there is no straight one: pendulums
+have 0.29 to 0.5, and what deforms 0.2 to 0.5, so that the held-out samples decide here, too."""
 SHARPEST = 4.0
 """Largest change of the velocity between two instants of a first path, in sides over the range."""
 PLACES = 64
@@ -61,8 +64,8 @@ def drifting(trial: Trial) -> Candidate | None:
 def find_bends(instants: NDArray[Any], straight: Path | None, bent: Path | None = None) -> Path | None:
     """Return the path of what moves in a video (K, n, n), as `drift.displacements` takes it.
 
-    It has to let much more add up than the ``straight`` one, or than `COHERENT` if there is none; None if no
-    path does. With one that is ``bent``, it is the best one near that.
+    It has to let much more add up than the ``straight`` one, or `ADDS_UP` if there is none; None if no path
+    does. With one that is ``bent``, it is the best one near that.
     """
     count, waves = len(instants), Waves(instants)
     if count <= 2 * ORDERS[-1] or waves.at_rest:
@@ -73,7 +76,7 @@ def find_bends(instants: NDArray[Any], straight: Path | None, bent: Path | None 
             return near
         more = _nearby(waves, near, ORDERS[-1])
         return more if _share(waves, more) > WORTH_MORE * _share(waves, near) else near
-    least: float = COHERENT
+    least: float = ADDS_UP / WORTH_BENDING
     starts: list[tuple[Path, int]] = []
     if straight is not None:
         least = waves.share(displacements(straight[:2], count, *straight[2:]))

@@ -107,8 +107,11 @@ is a candidate: a video that repeats itself claims more than any other. Motion t
 text that scrolls 0.9."""
 FOLLOWED = 0.95
 """Largest error of a volume that follows what moves, relative to one at rest after as many iterations, for
-which it goes on: text, bodies that cross the field, balls, pendulums and wheels have 0.5 to 0.94, and a
-splash, whose picture would be 1.0 to 1.3 dB worse, 0.953 and 0.96."""
+which it goes on: text, bodies that cross the field and wheels have 0.5 to 0.94, what swings or is moved by
+hand 0.4 to 0.88, and a splash, whose picture would be 1.0 to 1.7 dB worse, 0.97 to 1.1."""
+ROUGH = 1.2
+"""Largest error of a first trial on a path that bends, relative to one at rest, for which a better path is
+looked for: pendulums have up to 1.05."""
 CLOSE, NOT_FAR = 1.1, 2.0
 """Largest error of the cosines, relative to the best trial's, for which they are continued, and for which
 they are if clear patterns were found, or if only a glance was taken."""
@@ -365,13 +368,33 @@ def _following(volume: Trial, rival: float) -> Trial | None:
     for path in (drifting, turning):
         candidate = path(volume)
         if candidate is not None and not volume.bench.clock.spent(SEARCH_SHARE):
-            best = _on_path(volume, candidate, rival)
-            if best.error <= FOLLOWED * volume.error:
-                # The rim of a picture whose sides are 1 moves by π turns.
-                turns = [np.pi * abs(turn) for turn in candidate.rotation[:1]]
-                outdone = rival < OUTDONE * best.error
-                volume = found = best if outdone else _along(best, *turns or [fastest(candidate.drift)])
+            if len(candidate.drift) > 2:
+                best, at_rest = _on_bends(volume, candidate, rival)
+            else:
+                best, at_rest = _on_path(volume, candidate, rival), volume
+            if best.error <= FOLLOWED * at_rest.error:
+                volume = found = best if rival < OUTDONE * best.error else _along(best)
     return found
+
+
+def _on_bends(volume: Trial, candidate: Candidate, rival: float) -> tuple[Trial, Trial]:
+    """The best trial on a path that bends, and one at rest in as many cosines after as many iterations.
+
+    The first path is a rough one, on which little adds up, and what moves on it is often small. Only on a
+    better path and in enough cosines does it show whether that moves. At rest, these help, too.
+    """
+    bench = volume.bench
+    grounds = (replace(candidate, ground=ground) for ground in (0.0, GROUND))
+    found = min((bench.probe(each, min(volume.error, rival)) for each in grounds), key=_error)
+    if found.error > ROUGH * volume.error or bench.clock.spent(SEARCH_SHARE):
+        return volume, volume
+    still = replace(volume.candidate, ground=found.candidate.ground)
+    at_rest = volume if still == volume.candidate else bench.attempt(still, FIRST_ITERATIONS)
+    better = drifting(found) or found.candidate
+    count = _enough_cosines(found, better)
+    found = bench.attempt(replace(better, coefficients=count), NEXT_ITERATIONS, found)
+    at_rest = bench.attempt(replace(still, coefficients=count), NEXT_ITERATIONS, at_rest)
+    return found, min(at_rest, volume, key=_error)
 
 
 def _moving_in(bright: Trial) -> Trial:
@@ -412,22 +435,31 @@ def _on_path(at_rest: Trial, candidate: Candidate, rival: float) -> Trial:
     return found
 
 
-def _along(found: Trial, sides: float) -> Trial:
-    """A volume that follows what moves by so many ``sides``, on a better path and in enough cosines.
+def _along(found: Trial) -> Trial:
+    """A volume that follows what moves, on a better path and in enough cosines.
 
-    Weights are searched for later: those that suit a wrong path are wrong. A picture of n′ pixels that moves
-    by v sides turns its finest wave v·n′/2 times, which takes v·n′ cosines. With fewer, a search finds calmer
-    volumes better, and never arrives there.
+    Weights are searched for later: those that suit a wrong path are wrong.
     """
     found = found.bench.follow_path(found)
-    bench, finest = found.bench, sides * found.admm.theta.shape[1]
-    count = min(next((each for each in COSINES if each >= finest), COSINES[-1]), bench.frames)
+    count = _enough_cosines(found, found.candidate)
     if count > found.candidate.coefficients:
         found = _better(found, replace(found.candidate, coefficients=count))
     # What is followed is often nearly at rest. A search arrives there after both weights, for which a budget
     # may leave no time; without one, it does so by itself.
-    calmer = found.candidate.with_pace(PACE_STEP) if bench.clock.has_budget else None
+    calmer = found.candidate.with_pace(PACE_STEP) if found.bench.clock.has_budget else None
     return found if calmer is None else _better(found, calmer)
+
+
+def _enough_cosines(trial: Trial, candidate: Candidate) -> int:
+    """How many cosines a trial takes on a candidate's path.
+
+    A picture of n′ pixels that moves by v sides turns its finest wave v·n′/2 times, which takes v·n′ cosines.
+    With fewer, a search finds calmer volumes better, and never arrives there.
+    """
+    # The rim of a picture whose sides are 1 moves by π turns.
+    turns = [np.pi * abs(turn) for turn in candidate.rotation[:1]]
+    finest = max(turns or [fastest(candidate.drift)]) * trial.admm.theta.shape[1]
+    return min(next((each for each in COSINES if each >= finest), COSINES[-1]), trial.bench.frames)
 
 
 def _better(found: Trial, candidate: Candidate) -> Trial:
