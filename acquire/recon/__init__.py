@@ -11,6 +11,7 @@
     solvers        solver                the interface; solve, twist: the paper's, and a known image
                     │
     the default    choose                which prior predicts best; reuse: that of another part of the scene
+                    ├─ following         what moves as one, on a path that is read off a video
                     ├─ workbench         trials of candidates: still, volume, cycle, brightness; spectrum:
                     │                    of what flows; chosen: the best of them
                     └─ blinking          cosines: bandwidth, lamps, pursuit

@@ -40,6 +40,11 @@ ADDS_UP = 0.25
 have 0.29 to 0.5, and what deforms 0.2 to 0.5, so that the held-out samples decide here, too."""
 SHARPEST = 4.0
 """Largest change of the velocity between two instants of a first path, in sides over the range."""
+FIRST_SEEN = (0.1, 0.3, 0.5, 0.7, 0.9)
+"""Instants, as shares of the range, from which on what moves is looked for: from one that does not show it,
+another path is found."""
+FITS, NEAR = 12, 0.02
+"""Number of fits of a smooth path, and distance in sides up to which an instant counts in full."""
 PLACES = 64
 """Number of places along each side in which an instant is looked for."""
 STEPS = 60
@@ -81,11 +86,10 @@ def find_bends(instants: NDArray[Any], straight: Path | None, bent: Path | None 
     if straight is not None:
         least = waves.share(displacements(straight[:2], count, *straight[2:]))
         starts.append((straight[:2], ORDERS[0]))
-    tracked = _tracked(waves)
-    if waves.share(tracked) > least:
-        design = np.column_stack([np.ones(count), _polynomials(count, ORDERS[-1])])
-        smooth = np.linalg.lstsq(design, tracked, rcond=None)[0][1:]
-        starts.append((tuple(smooth.ravel()), ORDERS[-1]))
+    for first in FIRST_SEEN:
+        tracked = _tracked(waves, int(first * count))
+        if waves.share(tracked) > least:
+            starts.append((_smooth(tracked), ORDERS[-1]))
     best: Path | None = None
     least *= WORTH_BENDING
     for start, order in starts:
@@ -119,17 +123,19 @@ def _nearby(waves: Waves, start: Path, order: int) -> Path:
     return tuple(map(float, found.x))
 
 
-def _tracked(waves: Waves) -> NDArray[np.float64]:
-    """Where each instant (K, 2) matches best the sum of those from the first on that is looked for.
+def _smooth(tracked: NDArray[np.float64]) -> Path:
+    """The smooth path nearest to most of the instants; in what is far off, another thing was seen."""
+    count = len(tracked)
+    design, weights = np.column_stack([np.ones(count), _polynomials(count, ORDERS[-1])]), np.ones((count, 1))
+    for _ in range(FITS):
+        found = np.linalg.lstsq(design * weights, tracked * weights, rcond=None)[0]
+        missed = np.linalg.norm(tracked - design @ found, axis=1, keepdims=True)
+        weights = 1 / np.sqrt(np.maximum(missed, NEAR))  # so that distances add up, not their squares
+    return tuple(map(float, found[1:].ravel()))
 
-    That is one of three, of which one may not show what moves.
-    """
-    count = len(waves.amplitudes)
-    paths = [_tracked_from(waves, first) for first in (count // 4, count // 2, 3 * count // 4)]
-    return max(paths, key=waves.share)
 
-
-def _tracked_from(waves: Waves, first: int) -> NDArray[np.float64]:
+def _tracked(waves: Waves, first: int) -> NDArray[np.float64]:
+    """Where each instant (K, 2) matches best the sum of those from the first on that is looked for."""
     amplitudes, count = waves.amplitudes, len(waves.amplitudes)
     by, places = np.zeros((count, 2)), np.arange(PLACES) / PLACES
     rows = np.exp(2j * np.pi * places[:, None] * waves.down)

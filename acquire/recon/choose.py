@@ -23,7 +23,6 @@ import numpy as np
 
 from acquire.arrays import host
 from acquire.recon.basis import LearnedBasis
-from acquire.recon.bends import drifting
 from acquire.recon.blinking import (
     AT_REST,
     FIRST_LOOK_SHARE,
@@ -37,22 +36,18 @@ from acquire.recon.blinking import (
 )
 from acquire.recon.candidates import (
     CALM,
-    COSINES,
-    GROUND,
     GROUNDED,
-    PACE_STEP,
     SMOOTH,
     STILL,
     VOLUME,
 )
 from acquire.recon.cycle import TRIED_CHANGES, find_period
-from acquire.recon.drift import fastest
 from acquire.recon.estimates import Preferred, Refined
+from acquire.recon.following import OUTDONE, better, following, following_seen_in, moving_in, or_turning
 from acquire.recon.given import Given
 from acquire.recon.holdout import HeldOut
 from acquire.recon.patterns import find_patterns, has_clear_patterns
 from acquire.recon.reuse import reuse_choice
-from acquire.recon.rotation import turning
 from acquire.recon.solver import Preset, Solver
 from acquire.recon.spectrum import learn_spectrum
 from acquire.recon.still import best_still, change_bench, weighted_like
@@ -61,7 +56,6 @@ from acquire.recon.workbench import (
     FIRST_ITERATIONS,
     GAIN_OF_WEAKER,
     HOPELESS,
-    NEXT_ITERATIONS,
     SEARCH_SHARE,
     Workbench,
 )
@@ -70,7 +64,6 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from acquire.lines import Segment
-    from acquire.recon.candidates import Candidate
     from acquire.recon.clock import IterationClock
     from acquire.recon.estimates import Estimate, InBand
     from acquire.recon.options import SolveOptions
@@ -79,10 +72,6 @@ if TYPE_CHECKING:
 
 ITERATIONS_PER_TRIAL = 10
 """Iterations of a preset for each trial of a search."""
-OUTDONE = 0.6
-"""Largest error of the cosines at a glance, relative to the other candidates, for which they are continued
-before the others are searched, and of a rival of what follows, for which that goes no further. The glance of
-lamps has 0.25 to 0.55."""
 EVIDENT = 0.55
 """Largest error of a smooth volume, relative to a first volume and to one of changing brightness, for which
 it is evident that something flows."""
@@ -105,13 +94,6 @@ REPEATS = 0.8
 """Largest error of a cycle, relative to the volume's, the still's and the cosines' at a glance, for which it
 is a candidate: a video that repeats itself claims more than any other. Motion that repeats has 0.4 to 0.7,
 text that scrolls 0.9."""
-FOLLOWED = 0.95
-"""Largest error of a volume that follows what moves, relative to one at rest after as many iterations, for
-which it goes on: text, bodies that cross the field and wheels have 0.5 to 0.94, what swings or is moved by
-hand 0.4 to 0.88, and a splash, whose picture would be 1.0 to 1.7 dB worse, 0.97 to 1.1."""
-ROUGH = 1.2
-"""Largest error of a first trial on a path that bends, relative to one at rest, for which a better path is
-looked for: pendulums have up to 1.05."""
 CLOSE, NOT_FAR = 1.1, 2.0
 """Largest error of the cosines, relative to the best trial's, for which they are continued, and for which
 they are if clear patterns were found, or if only a glance was taken."""
@@ -199,7 +181,9 @@ def _try_motion(bench: Workbench, tried: _Tried, cosines: InBand, at_a_glance: f
     """
     tried.smooth = bench.probe(bench.fitting(SMOOTH), min(at_a_glance, tried.best.error))
     rival = min(at_a_glance, tried.smooth.error)
-    followed = None if tried.flows else _following(tried.volume, rival)
+    followed = None if tried.flows else following(tried.volume, rival)
+    if followed is None and not tried.flows and at_a_glance < OUTDONE * tried.volume.error:
+        followed = following_seen_in(cosines, tried.volume, rival)
     if followed is not None and followed.error < rival:
         return _in_its_light(followed, cosines.basis.cosines)
     # What flickers may seem to move. The first cosine is constant, so that this is the mean over time.
@@ -207,7 +191,7 @@ def _try_motion(bench: Workbench, tried: _Tried, cosines: InBand, at_a_glance: f
     still = np.broadcast_to(picture, (bench.frames, *picture.shape))
     tried.bright = bright = bench.brighten(still, cosines.basis.cosines, min(rival, tried.best.error))
     if bright is not None and bright is tried.best:
-        tried.bright = _moving_in(bright)
+        tried.bright = moving_in(bright)
     return followed
 
 
@@ -232,10 +216,10 @@ def _cycle(bench: Workbench, cosines: InBand, rival: float, *, lamps: bool) -> T
         return None
     cycle = bench.repeat(*repeats, rival)
     if REPEATS * rival <= cycle.error < rival:
-        cycle = _or_turning(cycle, rival)
+        cycle = or_turning(cycle, rival)
         # Sharp edges that move take more harmonics than a first trial has. Lamps are better off in patterns.
         finer = None if lamps else cycle.candidate.with_coefficients(1, bench.frames)
-        cycle = cycle if finer is None else _better(cycle, finer)
+        cycle = cycle if finer is None else better(cycle, finer)
     return cycle if cycle.error < REPEATS * rival else None
 
 
@@ -349,7 +333,7 @@ def _best_volume(bench: Workbench, tried: _Tried, rival: float) -> Trial:
     """The best of volumes at rest, volumes that follow what moves, and cycles, each after a first trial."""
     cycle = tried.cycle
     if cycle is not None and not cycle.candidate.rotation:
-        cycle = _or_turning(cycle, rival)
+        cycle = or_turning(cycle, rival)
     volume = tried.followed or cycle
     if volume is not None:
         return min(volume, cycle or volume, key=_error)
@@ -359,114 +343,7 @@ def _best_volume(bench: Workbench, tried: _Tried, rival: float) -> Trial:
     if volume is tried.volume and tried.smooth is not None:
         return volume  # what moves in it was looked for
     # The motion may show in a better video, though not in the first.
-    return _following(volume, rival) or volume
-
-
-def _following(volume: Trial, rival: float) -> Trial | None:
-    """The volume, following what drifts or turns in it, if that predicts better; None if it does not."""
-    found = None
-    for path in (drifting, turning):
-        candidate = path(volume)
-        if candidate is not None and not volume.bench.clock.spent(SEARCH_SHARE):
-            if len(candidate.drift) > 2:
-                best, at_rest = _on_bends(volume, candidate, rival)
-            else:
-                best, at_rest = _on_path(volume, candidate, rival), volume
-            if best.error <= FOLLOWED * at_rest.error:
-                volume = found = best if rival < OUTDONE * best.error else _along(best)
-    return found
-
-
-def _on_bends(volume: Trial, candidate: Candidate, rival: float) -> tuple[Trial, Trial]:
-    """The best trial on a path that bends, and one at rest in as many cosines after as many iterations.
-
-    The first path is a rough one, on which little adds up, and what moves on it is often small. Only on a
-    better path and in enough cosines does it show whether that moves. At rest, these help, too.
-    """
-    bench = volume.bench
-    grounds = (replace(candidate, ground=ground) for ground in (0.0, GROUND))
-    found = min((bench.probe(each, min(volume.error, rival)) for each in grounds), key=_error)
-    if found.error > ROUGH * volume.error or bench.clock.spent(SEARCH_SHARE):
-        return volume, volume
-    still = replace(volume.candidate, ground=found.candidate.ground)
-    at_rest = volume if still == volume.candidate else bench.attempt(still, FIRST_ITERATIONS)
-    better = drifting(found) or found.candidate
-    count = _enough_cosines(found, better)
-    found = bench.attempt(replace(better, coefficients=count), NEXT_ITERATIONS, found)
-    at_rest = bench.attempt(replace(still, coefficients=count), NEXT_ITERATIONS, at_rest)
-    return found, min(at_rest, volume, key=_error)
-
-
-def _moving_in(bright: Trial) -> Trial:
-    """A volume of changing brightness, or one that also follows what moves as one, if it predicts better."""
-    bench, best = bright.bench, bright
-    for path in (drifting, turning):
-        candidate = path(bright)
-        if candidate is None or bench.clock.spent(SEARCH_SHARE):
-            continue
-        bench.use_brightness(bright.brightness)
-        grounds = (replace(candidate, ground=ground) for ground in (0.0, GROUND))
-        found = min((bench.probe(each, bright.error) for each in grounds), key=_error)
-        if found.error < HOPELESS * bright.error:
-            best = min(best, bench.alternate(found), key=_error)
-    bench.use_brightness(best.brightness)
-    return best
-
-
-def _or_turning(cycle: Trial, rival: float) -> Trial:
-    """The cycle, or the same that follows what turns in it, if that predicts better."""
-    candidate = turning(cycle)
-    if candidate is None or cycle.bench.clock.spent(SEARCH_SHARE):
-        return cycle
-    found = _on_path(cycle, candidate, rival)
-    # A cycle at rest has had many rounds to fit its speed, and needs no head start.
-    return found if found is cycle else min(cycle, found.bench.follow_path(found), key=_error)
-
-
-def _on_path(at_rest: Trial, candidate: Candidate, rival: float) -> Trial:
-    """The better one of a trial and of a candidate with and without a ground.
-
-    Each starts from zero: a step from one to the other hardly arrives there.
-    """
-    found = at_rest
-    for ground in (0.0, GROUND):
-        probed = at_rest.bench.probe(replace(candidate, ground=ground), min(found.error, rival))
-        found = min(found, probed, key=_error)
-    return found
-
-
-def _along(found: Trial) -> Trial:
-    """A volume that follows what moves, on a better path and in enough cosines.
-
-    Weights are searched for later: those that suit a wrong path are wrong.
-    """
-    found = found.bench.follow_path(found)
-    count = _enough_cosines(found, found.candidate)
-    if count > found.candidate.coefficients:
-        found = _better(found, replace(found.candidate, coefficients=count))
-    # What is followed is often nearly at rest. A search arrives there after both weights, for which a budget
-    # may leave no time; without one, it does so by itself.
-    calmer = found.candidate.with_pace(PACE_STEP) if found.bench.clock.has_budget else None
-    return found if calmer is None else _better(found, calmer)
-
-
-def _enough_cosines(trial: Trial, candidate: Candidate) -> int:
-    """How many cosines a trial takes on a candidate's path.
-
-    A picture of n′ pixels that moves by v sides turns its finest wave v·n′/2 times, which takes v·n′ cosines.
-    With fewer, a search finds calmer volumes better, and never arrives there.
-    """
-    # The rim of a picture whose sides are 1 moves by π turns.
-    turns = [np.pi * abs(turn) for turn in candidate.rotation[:1]]
-    finest = max(turns or [fastest(candidate.drift)]) * trial.admm.theta.shape[1]
-    return min(next((each for each in COSINES if each >= finest), COSINES[-1]), trial.bench.frames)
-
-
-def _better(found: Trial, candidate: Candidate) -> Trial:
-    """The better one of a trial and of a candidate that continues it, if there is time for it."""
-    if found.bench.clock.spent(SEARCH_SHARE):
-        return found
-    return min(found, found.bench.attempt(candidate, NEXT_ITERATIONS, found), key=_error)
+    return following(volume, rival) or volume
 
 
 def _worth_refining(bench: Workbench, cosines: InBand, best: Trial) -> bool:

@@ -22,6 +22,7 @@
     smoke     smooth texture is stirred by vortices and drifts
     ball      a bright ball is thrown, falls and bounces before a textured still
     pendulum  a bright bob swings on a dark rod before a textured still
+    hopper    a bright ball hops across the whole field, fast
 
 Sizes are fractions of the picture and times fractions of the span, so that a scene is the same at any M, S
 and L_R; only the lamps have frequencies in sub-steps. The noise is that of a 12-bit camera whose brightest
@@ -384,6 +385,20 @@ def pendulum(s: Canvas) -> Callable[[int, float], Image]:
     return frame
 
 
+def hopper(s: Canvas) -> Callable[[int, float], Image]:
+    """A ball that crosses dark ground in two or three hops."""
+    radius, hops, height = s.rng.uniform([0.09, 2.0, 0.4], [0.13, 3.0, 0.6])
+
+    def frame(_t: int, tau: float) -> Image:
+        u = hops * tau % 1
+        image = _over(
+            np.full_like(s.x, 0.15), s.ball(0.82 - 4 * height * u * (1 - u), 0.2 + 0.6 * tau, radius), 0.9
+        )
+        return image.astype(np.float32)
+
+    return frame
+
+
 SCENES = {
     f.__name__: f
     for f in (
@@ -409,6 +424,7 @@ SCENES = {
         smoke,
         ball,
         pendulum,
+        hopper,
     )
 }
 

@@ -64,6 +64,15 @@ def test_a_path_that_bends_is_found_before_a_ground_and_in_noise(drift: tuple[fl
     np.testing.assert_allclose(displacements(again, COUNT), displacements(drift, COUNT), atol=0.01)
 
 
+def test_instants_that_show_other_things_do_not_bend_a_path_away() -> None:
+    video = moving(SWINGS)
+    for k, row in ((3, 7), (9, 11)):  # ghosts, each of a later instant and elsewhere
+        video[k] = np.roll(video[(k + 6) % COUNT], row, axis=0)
+    found = find_bends(video, find_drift(video))
+    assert found is not None
+    np.testing.assert_allclose(displacements(found, COUNT), displacements(SWINGS, COUNT), atol=0.03)
+
+
 def test_what_moves_straight_or_not_at_all_does_not_bend() -> None:
     rng, t = np.random.default_rng(6), np.arange(COUNT) / COUNT
     blinking = (1 + np.cos(40 * t))[:, None, None] * abs(texture(3))

@@ -134,7 +134,7 @@ def test_what_turns_is_followed(scene: str, monkeypatch: pytest.MonkeyPatch) -> 
     half = choice.candidate(len(found.video) // 2).rotation
     turns, *centre = found.parameters["rotation"]
     assert half == pytest.approx((turns if cyclic else turns / 2, *centre), abs=1e-2)
-    monkeypatch.setattr("acquire.recon.choose.turning", lambda _: None)
+    monkeypatch.setattr("acquire.recon.following.turning", lambda _: None)
     before = reconstruct(recorded.segment, 3, 1, preset="fast")
     assert before.parameters["rotation"] == ()
     assert found.quality.prediction < 0.9 * before.quality.prediction
