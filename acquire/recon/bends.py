@@ -35,9 +35,10 @@ WORTH_BENDING, WORTH_MORE = 1.2, 1.05
 Where it does bend, the share grows by 1.35 to 2.4, and for text and bodies that cross the field, in whose
 errors a path can bend, by 1.02 to 1.12. A splash seems to move on such a path as well: there, the held-out
 samples decide."""
-ADDS_UP = 0.25
-"""Share of the changing light that has to add up on a path in whose place there is no straight one: pendulums
-have 0.29 to 0.5, and what deforms 0.2 to 0.5, so that the held-out samples decide here, too."""
+CLEAR, FAINT = 0.36, 0.25
+"""Share of the changing light that has to add up on a path in whose place there is no straight one, to be
+tried at once and after all others. Pendulums have 0.29 to 0.5, but what flickers or deforms 0.2 to 0.5: the
+held-out samples decide, and the time that this takes may be missed."""
 SHARPEST = 4.0
 """Largest change of the velocity between two instants of a first path, in sides over the range."""
 FIRST_SEEN = (0.1, 0.3, 0.5, 0.7, 0.9)
@@ -51,14 +52,14 @@ STEPS = 60
 """Largest number of steps to the best path."""
 
 
-def drifting(trial: Trial) -> Candidate | None:
+def drifting(trial: Trial, adds_up: float = CLEAR) -> Candidate | None:
     """Return a trial's candidate that follows what moves in its video; None if nothing moves as one."""
     count, drift = trial.basis.count, trial.candidate.drift
     basis = TemporalBasis(count, count, trial.bench.problem.arrays)
     instants = host(basis.synthesize(trial.coefficients))
     bent = drift if len(drift) > 2 else None  # a video on such a path shows no velocity
     straight = None if bent else find_drift(instants)
-    found = find_bends(instants, straight, bent)
+    found = find_bends(instants, straight, bent, adds_up)
     if found is not None:
         return replace(trial.candidate, drift=found, speed_changes=(), rotation=())
     if straight is None:
@@ -66,11 +67,13 @@ def drifting(trial: Trial) -> Candidate | None:
     return replace(trial.candidate, drift=straight[:2], speed_changes=straight[2:], rotation=())
 
 
-def find_bends(instants: NDArray[Any], straight: Path | None, bent: Path | None = None) -> Path | None:
+def find_bends(
+    instants: NDArray[Any], straight: Path | None, bent: Path | None = None, adds_up: float = CLEAR
+) -> Path | None:
     """Return the path of what moves in a video (K, n, n), as `drift.displacements` takes it.
 
-    It has to let much more add up than the ``straight`` one, or `ADDS_UP` if there is none; None if no path
-    does. With one that is ``bent``, it is the best one near that.
+    It has to let much more add up than the ``straight`` one, or ``adds_up`` if there is none; None if no
+    path does. With one that is ``bent``, it is the best one near that.
     """
     count, waves = len(instants), Waves(instants)
     if count <= 2 * ORDERS[-1] or waves.at_rest:
@@ -81,7 +84,7 @@ def find_bends(instants: NDArray[Any], straight: Path | None, bent: Path | None 
             return near
         more = _nearby(waves, near, ORDERS[-1])
         return more if _share(waves, more) > WORTH_MORE * _share(waves, near) else near
-    least: float = ADDS_UP / WORTH_BENDING
+    least = adds_up / WORTH_BENDING
     starts: list[tuple[Path, int]] = []
     if straight is not None:
         least = waves.share(displacements(straight[:2], count, *straight[2:]))

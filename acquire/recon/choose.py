@@ -43,7 +43,7 @@ from acquire.recon.candidates import (
 )
 from acquire.recon.cycle import TRIED_CHANGES, find_period
 from acquire.recon.estimates import Preferred, Refined
-from acquire.recon.following import OUTDONE, better, following, following_seen_in, moving_in, or_turning
+from acquire.recon.following import OUTDONE, better, following, following_faint, moving_in, or_turning
 from acquire.recon.given import Given
 from acquire.recon.holdout import HeldOut
 from acquire.recon.patterns import find_patterns, has_clear_patterns
@@ -182,8 +182,6 @@ def _try_motion(bench: Workbench, tried: _Tried, cosines: InBand, at_a_glance: f
     tried.smooth = bench.probe(bench.fitting(SMOOTH), min(at_a_glance, tried.best.error))
     rival = min(at_a_glance, tried.smooth.error)
     followed = None if tried.flows else following(tried.volume, rival)
-    if followed is None and not tried.flows and at_a_glance < OUTDONE * tried.volume.error:
-        followed = following_seen_in(cosines, tried.volume, rival)
     if followed is not None and followed.error < rival:
         return _in_its_light(followed, cosines.basis.cosines)
     # What flickers may seem to move. The first cosine is constant, so that this is the mean over time.
@@ -192,6 +190,8 @@ def _try_motion(bench: Workbench, tried: _Tried, cosines: InBand, at_a_glance: f
     tried.bright = bright = bench.brighten(still, cosines.basis.cosines, min(rival, tried.best.error))
     if bright is not None and bright is tried.best:
         tried.bright = moving_in(bright)
+    elif followed is None and not tried.flows:
+        followed = following_faint(tried.volume, cosines, rival)
     return followed
 
 

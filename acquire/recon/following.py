@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from acquire.arrays import host
-from acquire.recon.bends import drifting, find_bends
+from acquire.recon.bends import FAINT, drifting, find_bends
 from acquire.recon.candidates import COSINES, GROUND, PACE_STEP
 from acquire.recon.drift import fastest
 from acquire.recon.rotation import turning
@@ -49,15 +49,19 @@ def following(volume: Trial, rival: float) -> Trial | None:
     return found
 
 
-def following_seen_in(cosines: InBand, volume: Trial, rival: float) -> Trial | None:
-    """A volume that follows what moves in the cosines' video, on a path that bends; None if nothing does.
+def following_faint(volume: Trial, cosines: InBand, rival: float) -> Trial | None:
+    """The volume, following what it shows only faintly on a path that bends; None if that does not help.
 
-    Small things that move fast are seen there, where many cosines show them, before they are in a volume.
+    Small things that move fast are seen in the video of the cosines, if these predict far better.
     """
-    matrix = host(cosines.basis.matrix())
+    candidate = drifting(volume, FAINT)
+    if candidate is not None and len(candidate.drift) > 2:
+        return _on_found_path(volume, candidate, rival)
+    if volume.bench.error(cosines.predict()) > OUTDONE * volume.error:
+        return None
+    matrix, theta = host(cosines.basis.matrix()), host(cosines.solver.theta)
     moments = ((np.arange(INSTANTS) + 0.5) / INSTANTS * matrix.shape[1]).astype(int)
-    theta = host(cosines.solver.theta)
-    path = find_bends(np.tensordot(matrix[:, moments].T, theta, axes=1), None)
+    path = find_bends(np.tensordot(matrix[:, moments].T, theta, axes=1), None, adds_up=FAINT)
     return None if path is None else _on_found_path(volume, replace(volume.candidate, drift=path), rival)
 
 
