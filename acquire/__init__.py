@@ -27,6 +27,7 @@ The layers, top to bottom; imports point downwards only (checked by the tests)::
     converter  noise                 a camera's non-linearity and noise
     arrays cores  loops   reading    array back ends · cores · compiled loops · safe reading of foreign files
     logs   plugins  showing scratch  log entries · classes of entry points · reprs · a run's directory
+    guarded                          objects of plug-ins, whose calls are checked
     errors text   lazy   place       errors with exit codes · foreign text · late imports · fixed paths
 
 `GLOSSARY.md`, next to this file, defines the terms; `DECISIONS.md` gives the reasons for the design and the

@@ -92,6 +92,13 @@ class Group:
         """Return name → class of all that can be imported, ours first."""
         return {plugin.name: _load(self, plugin.entry) for plugin in self.found() if not self.trouble(plugin)}
 
+    def whose(self, name: str) -> str:
+        """Return kind, name and distribution of somebody else's class, for errors; empty if it is ours."""
+        if any(plugin.name == name for plugin in _found_ours(self.name)):
+            return ""  # most are, and the metadata of other distributions need not be read
+        found = (plugin.origin for plugin in self.found() if plugin.name == name and not plugin.refused)
+        return "".join(f"{self.what} {name!r} of {origin}" for origin in found)
+
     def trouble(self, plugin: Plugin) -> str:
         """Return why an entry point of this group is unusable, or an empty text. Imports it."""
         if plugin.refused:

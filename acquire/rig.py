@@ -8,9 +8,11 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any, Self, cast
 
-from acquire.errors import AcquireError, ConfigError, TriggerError, UsageError
+from acquire.camera.checked import checked_opener
+from acquire.errors import ConfigError, UsageError
 from acquire.lines import ARMS
 from acquire.plugins import CAMERAS, CODECS, TRIGGERS, of_others
+from acquire.trigger.checked import open_checked
 
 if TYPE_CHECKING:
     from types import TracebackType
@@ -41,16 +43,7 @@ class Rig:
 
             self._simulated = SimulatedDevices(config)
         self._closed = False
-        try:
-            self.trigger: Trigger = _trigger(config).open(config, self._simulated)
-        except AcquireError:
-            raise
-        except Exception as error:  # somebody else's driver may fail in any way
-            what = f"trigger driver {config.trigger.driver!r} failed to open"
-            raise TriggerError(
-                f"{what}: {type(error).__name__}: {error}",
-                hint="its cable and options; else its author, by the distribution that acquire plugins names",
-            ) from error
+        self.trigger: Trigger = open_trigger(config, self._simulated)
 
     def openers(self) -> dict[str, CameraOpener]:
         """Return arm → opener of its camera, for use here or in a child process."""
@@ -61,7 +54,10 @@ class Rig:
     def _opener(self, arm: str) -> CameraOpener:
         if self.config.simulation.replay is not None:
             return self.simulated.replay(arm)
-        variant = cast("CameraVariant", self.config.cameras.arm(arm).options)
+        camera = self.config.cameras.arm(arm)
+        variant = cast("CameraVariant", camera.options)
+        if whose := CAMERAS.whose(camera.driver):
+            return checked_opener(whose, variant, self.config, arm, self._simulated)
         return variant.opener(self.config, arm, self._simulated)
 
     @property
@@ -163,9 +159,11 @@ def _check_simulated_cameras(config: RigConfig) -> None:
             raise ConfigError(f"trigger.{key} cannot be simulated", possible=possible)
 
 
-def open_trigger(config: RigConfig) -> Trigger:
+def open_trigger(config: RigConfig, simulated: SimulatedDevices | None = None) -> Trigger:
     """Return the rig's trigger without its cameras; it connects at its first use."""
-    return _trigger(config).open(config, None)
+    if whose := TRIGGERS.whose(config.trigger.driver):
+        return open_checked(whose, _trigger(config), config, simulated)
+    return _trigger(config).open(config, simulated)
 
 
 def _trigger(config: RigConfig) -> TriggerVariant:

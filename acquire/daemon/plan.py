@@ -9,6 +9,7 @@ from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Any
 
 from acquire.calibrate.choose import carried_calibration
+from acquire.camera.checked import CheckedOpener
 from acquire.config import ConstantCodeConfig
 from acquire.daemon.devices import KnownDevices
 from acquire.daemon.events import budget_lines, window_of
@@ -158,7 +159,8 @@ def with_code(config: RigConfig, code: LightCode) -> RigConfig:
 
 def worker_modules(rig: Rig) -> tuple[str, ...]:
     """Return the modules that a run's processes import, to be imported once before any run is armed."""
-    modules = {type(opener).__module__ for opener in rig.openers().values()}
+    openers = [each.opener if isinstance(each, CheckedOpener) else each for each in rig.openers().values()]
+    modules = {type(opener).__module__ for opener in openers}
     modules |= {f"acquire.stream.{name}" for name in ("recorder", "grabber", "watcher")}
     if rig.config.simulates_cameras:
         modules.add("acquire.sim.pipeline")  # imported by simulated cameras when they are opened

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import contextlib
 import time
 from typing import TYPE_CHECKING
 
-from acquire.errors import AcquireError
+from acquire.errors import AcquireError, DeviceError
 from acquire.stream.external_counts import TRIGGER_COUNTERS
 from acquire.stream.messages import Note
 from acquire.stream.tagger import tag_rows
@@ -55,16 +54,14 @@ class TagFeed:
         if self._lost:
             return []
         try:
-            tags = self._trigger.tags(wait_s)
+            tags, events = self._trigger.tags(wait_s), self._trigger.events()
         except Exception as error:  # noqa: BLE001 - a fault; a driver's defect must not cost the recording
-            self._lost = True
-            kind = "" if isinstance(error, AcquireError) else f"{type(error).__name__}: "
-            self._fail(f"trigger: {kind}{error}")
+            self._give_up(error)
             return []
         if tags:
             self.newest_pulse = tags[-1].line
             self.heard_s = time.monotonic()
-        for event in self._trigger.events():
+        for event in events:
             self._report(Note(event.line, event.kind, f"tick {event.tick}"))
             if event.kind == WATCHDOG:  # no line comes any more: a recording that began now would be empty
                 self._lost = True
@@ -89,10 +86,19 @@ class TagFeed:
         if self._lost or now_s < self._query_s:
             return
         self._query_s = now_s + _QUERY_EVERY_S
-        # A trigger that cannot answer fails in `take`, which reports it.
-        with contextlib.suppress(AcquireError):
+        try:
             counts = self._trigger.statistics()
-            for name in TRIGGER_COUNTERS:
-                self._counters[name] = int(counts.get(name, 0))
-            if "link_lost" not in counts:
-                self.heard_s = time.monotonic()
+        except DeviceError:
+            return  # a trigger that cannot answer fails in `take`, which reports it
+        except AcquireError as error:  # it answers, but with something else
+            self._give_up(error)
+            return
+        for name in TRIGGER_COUNTERS:
+            self._counters[name] = int(counts.get(name, 0))
+        if "link_lost" not in counts:
+            self.heard_s = time.monotonic()
+
+    def _give_up(self, error: Exception) -> None:
+        self._lost = True
+        kind = "" if isinstance(error, AcquireError) else f"{type(error).__name__}: "
+        self._fail(f"trigger: {kind}{error}")

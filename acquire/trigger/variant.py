@@ -7,7 +7,8 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Any, ClassVar
 
 from acquire.config.base import FrozenModel
-from acquire.errors import ConfigError, TriggerError
+from acquire.errors import ConfigError, TriggerError, UsageError
+from acquire.text import shown
 from acquire.trigger.base import TriggerRun
 from acquire.trigger.driver import TriggerDriver
 from acquire.trigger.settings import GATEWARE, register_values
@@ -61,7 +62,13 @@ class GatewareTrigger(TriggerVariant):
         return replace(GATEWARE, clock_hz=trigger.clock_hz)
 
     def open(self, config: RigConfig, bench: Any) -> Trigger:
-        return TriggerDriver(self.transport(config, bench), config.trigger)
+        connect = self.transport(config, bench)
+        if not callable(connect):
+            raise UsageError(
+                f"trigger driver {config.trigger.driver!r} gave back {shown(connect)} from transport",
+                possible="a function that opens the transport",
+            )
+        return TriggerDriver(connect, config.trigger)
 
     def check(self, config: RigConfig) -> None:
         trigger = config.trigger
