@@ -118,7 +118,7 @@ def test_text_that_scrolls_is_followed(monkeypatch: pytest.MonkeyPatch) -> None:
     assert choice is not None
     half = choice.candidate(len(found.video) // 2)
     assert half.drift == pytest.approx((rows / 2, columns / 2), abs=1e-3)
-    monkeypatch.setattr("acquire.recon.following.drifting", lambda _: None)
+    monkeypatch.setattr("acquire.recon.following.drifting", lambda *_: None)
     before = reconstruct(recorded.segment, 3, 1)
     assert before.parameters["drift"] == ()
     assert found.quality.prediction < 0.8 * before.quality.prediction
