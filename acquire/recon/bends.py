@@ -89,10 +89,10 @@ def find_bends(
     if straight is not None:
         least = waves.share(displacements(straight[:2], count, *straight[2:]))
         starts.append((straight[:2], ORDERS[0]))
-    for first in FIRST_SEEN:
-        tracked = _tracked(waves, int(first * count))
-        if waves.share(tracked) > least:
-            starts.append((_smooth(tracked), ORDERS[-1]))
+    tracked = [_tracked(waves, int(first * count)) for first in FIRST_SEEN]
+    smooth = [_smooth(each) for each in tracked if waves.share(each) > least]
+    if smooth:  # one of them, because finding the best path near it takes most of the time
+        starts.append((max(smooth, key=lambda path: _share(waves, path)), ORDERS[-1]))
     best: Path | None = None
     least *= WORTH_BENDING
     for start, order in starts:

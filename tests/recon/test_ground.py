@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from acquire.evaluate.metrics import psnr
-from acquire.recon import choose, reconstruct
+from acquire.recon import choose, following, reconstruct
 from acquire.recon.candidates import CYCLE, GROUND, GROUNDED, STILL, VOLUME, Candidate
 from acquire.recon.ground import GroundedTv
 from acquire.recon.tv import FrameTv
@@ -102,7 +102,7 @@ def test_what_moves_before_a_textured_ground_leaves_it_its_detail(monkeypatch: p
     grounded = reconstruct(recorded.segment, 3, 1, error=False)
     assert grounded.parameters["ground"] > 0
     monkeypatch.setattr(choose, "GROUNDED", VOLUME)
-    monkeypatch.setattr(choose, "GROUND", 0.0)
+    monkeypatch.setattr(following, "GROUND", 0.0)
     monkeypatch.setattr(Candidate, "with_ground", lambda *_, **__: None)
     without = reconstruct(recorded.segment, 3, 1, error=False)
     assert not without.parameters.get("ground")
