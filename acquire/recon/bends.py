@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.polynomial.legendre import legvander
+from scipy.ndimage import maximum_filter
 from scipy.optimize import minimize
 
 from acquire.arrays import host
@@ -21,6 +22,8 @@ from acquire.recon.basis import TemporalBasis
 from acquire.recon.drift import Waves, displacements, find_drift
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from numpy.typing import NDArray
 
     from acquire.recon.candidates import Candidate
@@ -28,8 +31,9 @@ if TYPE_CHECKING:
 
     Path = tuple[float, ...]
 
-ORDERS = (3, 8)
-"""Highest polynomials of a path: one that speeds up or falls takes 2 or 3, and one that turns back 8."""
+ORDERS = (3, 8, 26)
+"""Highest polynomials of a path: one that speeds up or falls takes 2 or 3, one that turns back 8, and one
+with the corners of something that bounces 26."""
 WORTH_BENDING, WORTH_MORE = 1.2, 1.05
 """Least gain of the share that adds up for which a path bends, and for which it takes the higher polynomials.
 Where it does bend, the share grows by 1.35 to 2.4, and for text and bodies that cross the field, in whose
@@ -48,6 +52,9 @@ FITS, NEAR = 12, 0.02
 """Number of fits of a smooth path, and distance in sides up to which an instant counts in full."""
 PLACES = 64
 """Number of places along each side in which an instant is looked for."""
+PLACED = np.arange(PLACES) / PLACES
+QUICKEST = 8.0
+"""Largest velocity on a path that is looked for from end to end, in sides over the range."""
 STEPS = 60
 """Largest number of steps to the best path."""
 
@@ -76,30 +83,35 @@ def find_bends(
     path does. With one that is ``bent``, it is the best one near that.
     """
     count, waves = len(instants), Waves(instants)
-    if count <= 2 * ORDERS[-1] or waves.at_rest:
+    orders = [each for each in ORDERS if 2 * each < count]
+    if len(orders) < 2 or waves.at_rest:
         return bent
     if bent is not None:
         near = _nearby(waves, bent, len(bent) // 2)
-        if len(bent) == 2 * ORDERS[-1]:
-            return near
-        more = _nearby(waves, near, ORDERS[-1])
-        return more if _share(waves, more) > WORTH_MORE * _share(waves, near) else near
+        for order in (each for each in orders if 2 * each > len(bent)):
+            near = _better(waves, near, _nearby(waves, near, order))
+        return near
     least = adds_up / WORTH_BENDING
     starts: list[tuple[Path, int]] = []
     if straight is not None:
         least = waves.share(displacements(straight[:2], count, *straight[2:]))
-        starts.append((straight[:2], ORDERS[0]))
+        starts.append((straight[:2], orders[0]))
     tracked = [_tracked(waves, int(first * count)) for first in FIRST_SEEN]
-    smooth = [_smooth(each) for each in tracked if waves.share(each) > least]
-    if smooth:  # one of them, because finding the best path near it takes most of the time
-        starts.append((max(smooth, key=lambda path: _share(waves, path)), ORDERS[-1]))
+    if tracked := [each for each in tracked if waves.share(each) > least]:
+        for order in orders[1:]:  # one of each, because finding the best path near it takes most of the time
+            smooth = (_smooth(each, order) for each in tracked)
+            starts.append((max(smooth, key=lambda path: waves.added(displacements(path, count))), order))
     best: Path | None = None
-    least *= WORTH_BENDING
     for start, order in starts:
         found = _nearby(waves, start, order)
-        if (share := _share(waves, found)) > least:
-            best, least = found, WORTH_MORE * share
+        if _share(waves, found) > WORTH_BENDING * least:
+            best = found if best is None else _better(waves, best, found)
     return best
+
+
+def _better(waves: Waves, path: Path, more: Path) -> Path:
+    """The path with more polynomials, if it is worth them."""
+    return more if _share(waves, more) > WORTH_MORE * _share(waves, path) else path
 
 
 def _share(waves: Waves, path: Path) -> float:
@@ -126,10 +138,10 @@ def _nearby(waves: Waves, start: Path, order: int) -> Path:
     return tuple(map(float, found.x))
 
 
-def _smooth(tracked: NDArray[np.float64]) -> Path:
+def _smooth(tracked: NDArray[np.float64], order: int) -> Path:
     """The smooth path nearest to most of the instants; in what is far off, another thing was seen."""
     count = len(tracked)
-    design, weights = np.column_stack([np.ones(count), _polynomials(count, ORDERS[-1])]), np.ones((count, 1))
+    design, weights = np.column_stack([np.ones(count), _polynomials(count, order)]), np.ones((count, 1))
     for _ in range(FITS):
         found = np.linalg.lstsq(design * weights, tracked * weights, rcond=None)[0]
         missed = np.linalg.norm(tracked - design @ found, axis=1, keepdims=True)
@@ -138,20 +150,53 @@ def _smooth(tracked: NDArray[np.float64]) -> Path:
 
 
 def _tracked(waves: Waves, first: int) -> NDArray[np.float64]:
-    """Where each instant (K, 2) matches best the sum of those from the first on that is looked for."""
+    """Where what is looked for from the first instant on is at each instant (K, 2)."""
+    return _among_all(waves, _seen_from(waves, first))
+
+
+def _seen_from(waves: Waves, first: int) -> NDArray[np.float64]:
+    """Where each instant (K, 2) matches best the sum of those between it and the first."""
     amplitudes, count = waves.amplitudes, len(waves.amplitudes)
-    by, places = np.zeros((count, 2)), np.arange(PLACES) / PLACES
-    rows = np.exp(2j * np.pi * places[:, None] * waves.down)
-    columns = np.exp(2j * np.pi * places[:, None] * waves.across) * waves.weights
+    by, match_at = np.zeros((count, 2)), _matching(waves)
     for way in (1, -1):
         seen, step = amplitudes[first].copy(), np.zeros(2)
         for k in range(first + way, count if way > 0 else -1, way):
             expected = by[k - way] + step
-            match = (rows @ (amplitudes[k] * seen.conj()) @ columns.T).real
-            down, right = ((places - each + 0.5) % 1 - 0.5 for each in expected)
+            match = match_at(amplitudes[k] * seen.conj())
+            down, right = ((PLACED - each + 0.5) % 1 - 0.5 for each in expected)
             near = abs(np.stack(np.meshgrid(down, right, indexing="ij"))).max(axis=0) <= SHARPEST / count
             row, column = np.unravel_index(np.where(near, match, -np.inf).argmax(), match.shape)
             by[k] = expected + np.array([down[row], right[column]])
             step = by[k] - by[k - way]
             seen += amplitudes[k] * waves.turns(by[k])
     return by
+
+
+def _among_all(waves: Waves, by: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Where all instants (K, 2) together match best the sum of the others, which a first path gives.
+
+    An instant that was not recognised led the first path astray, but not this one: of all paths that are not
+    too fast, it is the best from end to end (Viterbi).
+    """
+    count, match_at = len(by), _matching(waves)
+    moved = waves.amplitudes * waves.turns(by)
+    others = moved.sum(axis=0) - moved
+    reach = int(np.ceil(PLACES * QUICKEST / count))
+    sums = [match_at(waves.amplitudes[0] * others[0].conj())]
+    for k in range(1, count):
+        match = match_at(waves.amplitudes[k] * others[k].conj())
+        sums.append(match + maximum_filter(sums[-1], size=2 * reach + 1, mode="wrap"))
+    near, places = np.arange(-reach, reach + 1), np.zeros((count, 2), int)
+    places[-1] = np.unravel_index(sums[-1].argmax(), sums[-1].shape)
+    for k in range(count - 2, -1, -1):
+        around = (places[k + 1][:, None] + near) % PLACES
+        row, column = np.unravel_index(sums[k][np.ix_(*around)].argmax(), (len(near), len(near)))
+        places[k] = around[0, row], around[1, column]
+    return np.unwrap(places / PLACES, axis=0, period=1.0)
+
+
+def _matching(waves: Waves) -> Callable[[NDArray[Any]], NDArray[np.float64]]:
+    """What turns the products of two instants' waves into how well these match, moved by `PLACED` (…, …)."""
+    rows = np.exp(2j * np.pi * PLACED[:, None] * waves.down)
+    columns = np.exp(2j * np.pi * PLACED[:, None] * waves.across) * waves.weights
+    return lambda product: (rows @ product @ columns.T).real

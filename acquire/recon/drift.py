@@ -120,6 +120,13 @@ class Waves:
         left = np.maximum(1 - np.square(abs(turns.mean(axis=0))), LEAST_LEFT)
         return float(np.sum(power / left @ self.weights))
 
+    def added(self, by: NDArray[np.float64]) -> float:
+        """The same share without what the mean over time holds.
+
+        This tells the path of a body from one on which everything hardly moves.
+        """
+        return float(np.sum(np.square(abs((self.amplitudes * self.turns(by)).sum(axis=0))) @ self.weights))
+
     def slope(self, by: NDArray[np.float64]) -> NDArray[np.float64]:
         """The derivative of `share` by each displacement (K, 2)."""
         turns = self.turns(by)

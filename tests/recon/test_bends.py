@@ -8,7 +8,7 @@ from scipy.ndimage import gaussian_filter
 
 from acquire.evaluate.metrics import psnr
 from acquire.recon import reconstruct
-from acquire.recon.bends import ORDERS, find_bends
+from acquire.recon.bends import ORDERS, _seen_from, _tracked, find_bends
 from acquire.recon.drift import Path, Waves, displacements, fastest, find_drift
 from acquire.recon.reuse import Choice
 from acquire.sim.procedural import record
@@ -73,6 +73,45 @@ def test_instants_that_show_other_things_do_not_bend_a_path_away() -> None:
     np.testing.assert_allclose(displacements(found, COUNT), displacements(SWINGS, COUNT), atol=0.03)
 
 
+def hopping(hops: float, count: int) -> np.ndarray:
+    """The displacements of something that crosses the field in hops, in sides."""
+    t = (np.arange(count) + 0.5) / count
+    u = hops * t % 1
+    by = np.column_stack([-1.6 * u * (1 - u), 0.5 * t])
+    return by - by.mean(axis=0)
+
+
+def on(by: np.ndarray, noise: float) -> np.ndarray:
+    """A texture that is moved by so many sides at each instant, in noise."""
+    waves = np.fft.fft2(texture(1))
+    f = np.fft.fftfreq(SIDE, 1 / SIDE)
+    turns = np.exp(-2j * np.pi * (by[:, :1, None] * f[:, None] + by[:, 1:, None] * f))
+    moved = np.fft.ifft2(waves * turns).real
+    return np.asarray(moved + noise * moved.std() * np.random.default_rng(2).standard_normal(moved.shape))
+
+
+def test_the_corners_of_a_path_are_followed_where_there_are_instants_enough() -> None:
+    for count, far in ((54, 0.03), (24, 0.08)):
+        by = hopping(2.4, count)
+        found = find_bends(on(by, 0.3), None)
+        assert found is not None
+        missed = displacements(found, count) - by
+        assert np.median(np.linalg.norm(missed - np.median(missed, axis=0), axis=1)) < far
+        assert len(found) == 2 * max(order for order in ORDERS if 2 * order < count)
+
+
+def test_a_path_that_noise_leads_astray_is_found_from_end_to_end() -> None:
+    by = hopping(1.7, 54)
+    waves = Waves(on(by, 5.0))
+
+    def missed(path: np.ndarray) -> float:
+        off = path - by
+        return float(np.median(np.linalg.norm(off - np.median(off, axis=0), axis=1)))
+
+    assert missed(_tracked(waves, 5)) < 0.06
+    assert missed(_seen_from(waves, 5)) > 1  # the next instant alone, without those after it
+
+
 def test_what_moves_straight_or_not_at_all_does_not_bend() -> None:
     rng, t = np.random.default_rng(6), np.arange(COUNT) / COUNT
     blinking = (1 + np.cos(40 * t))[:, None, None] * abs(texture(3))
@@ -98,3 +137,13 @@ def test_what_falls_and_swings_is_followed(
     before = reconstruct(recorded.segment, 3, 1)
     assert found.quality.prediction < 0.95 * before.quality.prediction
     assert psnr(found.video[found.trusted], truth) > psnr(before.video[before.trusted], truth) + gain_db
+
+
+def test_what_hops_fast_is_not_taken_for_something_that_flows() -> None:
+    recorded = record("hopper", 1, lines=135)
+    truth = recorded.truth(3, 1)
+    found = reconstruct(recorded.segment, 3, 1)
+    assert found.parameters["prior"] == "volume"
+    # A smooth volume, which predicts as well, is no better than the mean over time.
+    mean = np.broadcast_to(truth.mean(axis=0), truth.shape)
+    assert psnr(found.video[found.trusted], truth) > psnr(mean, truth) + 6
