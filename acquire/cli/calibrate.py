@@ -410,10 +410,9 @@ def _exists(place: str) -> bool:
 
 def _keep(place: str, found: Finding, *, json: bool, new: bool = False) -> None:
     """Add a finding to the calibration at a place, and print it."""
-    from acquire.calibrate import Calibration, save_calibration
+    from acquire.calibrate import Calibration
+    from acquire.calibrate.file import change_calibration
 
-    # Only steps that need no earlier one may begin a calibration.
-    known = Calibration(found.instrument) if new and not _exists(place) else _known(place)
     # Shown all the same: the figures say by how little the views differ. Saved, it would count as known.
     if found.step == "orientation" and found.orientation is None:
         _print_finding(found, None, json=json)
@@ -421,7 +420,9 @@ def _keep(place: str, found: Finding, *, json: bool, new: bool = False) -> None:
             f"the orientation cannot be determined from {found.facts['recording']}",
             hint="a stationary target with sharp, irregular texture, or more lines",
         )
-    save_calibration(place, known.with_step(found))
+    # Only steps that need no earlier one may begin a calibration.
+    begun = Calibration(found.instrument) if new else None
+    change_calibration(place, lambda known: known.with_step(found), new=begun)
     _print_finding(found, place, json=json)
 
 

@@ -123,14 +123,16 @@ def save_finding(out: str, exposure: Exposure, evaluate: Callable[[Calibration],
 
     Raises UsageError if the exposure does not determine the orientation.
     """
-    from acquire.calibrate import Calibration, open_calibration, save_calibration
+    from acquire.calibrate import Calibration, open_calibration
+    from acquire.calibrate.file import change_calibration
     from acquire.store.source import source_of
 
     known = open_calibration(out) if source_of(out).exists() else Calibration(exposure.instrument)
     found = evaluate(known)
     if found.step == "orientation" and found.orientation is None:
         raise UsageError(f"orientation: {found.warnings[0]}")
-    save_calibration(out, known.with_step(found))
+    # Of what is there now: another command may have added a step during the evaluation.
+    change_calibration(out, lambda now: now.with_step(found), new=Calibration(exposure.instrument))
     return found
 
 

@@ -14,6 +14,7 @@
       by others        variant → plugin_codecs, zarr_codec
     where              files, pages, host, mount  source → disk | remote (URLs)
       all or nothing   delivery, refusals
+      replaced         swap
 
 An `Outline` is a recording without its lines: it and everything that it uses need no array library. Names are
 imported from here lazily, so that a list of recordings comes at once. No module may have the name of a

@@ -31,6 +31,7 @@ SCRATCH = ".next"
 
 # Never a file that exists, nor one to which a link of that name leads.
 _NEW = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC
+_AT_FDCWD, _RENAME_EXCHANGE = -100, 2
 _WRITABLE = stat.S_IWUSR | stat.S_IWGRP | stat.S_IWOTH
 
 NO_LOCKS = (errno.ENOLCK, errno.EOPNOTSUPP, errno.ENOSYS)
@@ -232,6 +233,18 @@ class Disk:
     def rename(self, source: Path, target: Path) -> None:
         """Replace ``target`` in one step."""
         source.replace(target)
+
+    def exchange(self, one: Path, other: Path) -> None:
+        """Exchange the names of two files or directories in one step, if the file system can."""
+        import ctypes  # only for this, which happens rarely
+
+        library = ctypes.CDLL(None, use_errno=True)
+        if not hasattr(library, "renameat2"):  # not glibc, or one from before 2018
+            raise OSError(errno.ENOSYS, os.strerror(errno.ENOSYS))
+        names = os.fsencode(one), os.fsencode(other)
+        if library.renameat2(_AT_FDCWD, names[0], _AT_FDCWD, names[1], _RENAME_EXCHANGE):
+            code = ctypes.get_errno()
+            raise OSError(code, os.strerror(code), str(one), None, str(other))
 
     def remove(self, path: Path) -> None:
         """Remove a file, if it exists."""
