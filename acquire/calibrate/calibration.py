@@ -240,18 +240,21 @@ class Calibration:
         """Return the values of a quantity, or None if it was not measured."""
         return self.quantities[name].value if name in self.quantities else None
 
+    def check_same(self, other: Instrument, what: str, place: str) -> None:
+        """Raise UsageError unless ``other``, on which ``what`` was made, is this calibration's instrument."""
+        if differences := differences_between(self.instrument, other):
+            raise UsageError(
+                f"{what} is of another instrument than {place}: " + "; ".join(differences),
+                possible="a calibration of the same instrument, or a new one",
+                hint="--out with another name",
+            )
+
     def with_step(self, found: Finding) -> Calibration:
         """Return the calibration with a step's result in place of earlier ones.
 
         Raises UsageError if the step's recordings are of another instrument.
         """
-        differences = differences_between(self.instrument, found.instrument)
-        if differences:
-            raise UsageError(
-                f"the recordings of {found.step!r} come from another instrument than the calibration: "
-                + "; ".join(differences),
-                hint="another calibration for it: --out NAME.zarr",
-            )
+        self.check_same(found.instrument, f"the recording of step {found.step!r}", "the calibration")
         now = datetime.now(UTC).isoformat(timespec="seconds")
         step = {**found.facts, "made": now, "warnings": list(found.warnings)}
         if found.usable is not None:

@@ -16,6 +16,7 @@ from acquire.lines import ARMS
 from acquire.text import counted
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
     from pathlib import Path
 
     from acquire.config import RigConfig
@@ -116,6 +117,23 @@ def carried_calibration(config: RigConfig, layout: str) -> Carried:
         )
     text = f"{place}: {', '.join(known.steps)}"
     return Carried({"calibration": known.to_attrs()}, place, text)
+
+
+def check_rig(
+    known: Calibration, place: str, config: RigConfig, reported: Mapping[str, Mapping[str, Any]]
+) -> None:
+    """Raise UsageError for a calibration of another instrument than a rig's.
+
+    ``reported`` are settings that its cameras have reported, as `exposure.camera_of` returns them: arm →
+    settings, and empty before they are armed.
+    """
+    # A simulated rig with two cameras has the layout of its scene's optics, which its file does not state.
+    layout: str = config.cameras.layout
+    if layout == "dual" and known.instrument.layout not in ("compact", "fibre"):
+        layout = known.instrument.layout
+    rig = configured(config, layout)
+    cameras = {arm: {**rig.cameras[arm], **reported.get(arm, {})} for arm in ARMS}
+    known.check_same(rig.model_copy(update={"cameras": cameras}), f"rig {config.name}", place)
 
 
 def configured(config: RigConfig, layout: str) -> Instrument:

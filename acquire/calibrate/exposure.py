@@ -14,7 +14,7 @@ from acquire.lines import ARMS
 from acquire.store import open_recording
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
+    from collections.abc import Callable, Iterator, Mapping
     from pathlib import Path
 
     from numpy.typing import NDArray
@@ -139,16 +139,20 @@ def open_exposure(place: Path | str, first_line: int | None = None, lines: int |
     return Exposure(recording, first, count)
 
 
+def camera_of(facts: Mapping[str, Any]) -> dict[str, Any]:
+    """Return what lines depend on of what a camera reports: `SETTINGS`, and ``serial`` if it states one."""
+    serial = facts.get("identity", {}).get("serial") or facts.get("DeviceSerialNumber")
+    known = {"serial": serial} if serial else {}
+    return known | {key: facts[key] for key in SETTINGS if key in facts}
+
+
 def instrument_of(recording: Recording) -> Instrument:
     """Return the instrument that made a recording, as far as the recording describes it."""
     attrs = recording.attrs
     cameras = {}
     for arm in ARMS:
-        facts = attrs["cameras"][arm]
         configured = attrs.get("config", {}).get("cameras", {}).get(arm, {})
-        serial = facts.get("identity", {}).get("serial") or facts.get("DeviceSerialNumber")
-        settings = {key: facts[key] for key in SETTINGS if key in facts}
-        cameras[arm] = {"serial": serial or configured.get("serial", "unknown"), **settings}
+        cameras[arm] = {"serial": configured.get("serial", "unknown"), **camera_of(attrs["cameras"][arm])}
     geometry = recording.geometry_for(1)
     return Instrument(
         stages=geometry.stages,

@@ -10,6 +10,7 @@ import typer
 from acquire.cli.calibrate_all import calibrate_all
 from acquire.cli.calibrate_delay import delay
 from acquire.cli.calibrate_linearity import linearity
+from acquire.cli.calibrate_live import refuse_other
 from acquire.cli.calibrate_sheet import sheet
 from acquire.cli.completion import recordings
 from acquire.cli.output import JsonFlag, print_facts, print_json, print_table, print_warning, say
@@ -94,7 +95,7 @@ def dark(
     """
     from acquire.calibrate import columns
 
-    exposure = _exposure(recording, first_line, lines, begin, end)
+    exposure = _exposure(recording, first_line, lines, begin, end, out)
     with stage_progress(f"reading {recording}") as advance:
         found = columns.dark(exposure, covered=covered, progress=advance)
     _keep(out, found, json=json, new=True)
@@ -118,7 +119,7 @@ def ambient(
     """
     from acquire.calibrate import columns
 
-    known, exposure = _known(out), _exposure(recording, first_line, lines, begin, end)
+    known, exposure = _known(out), _exposure(recording, first_line, lines, begin, end, out)
     with stage_progress(f"reading {recording}") as advance:
         found = columns.ambient(exposure, known, progress=advance)
     _keep(out, found, json=json)
@@ -149,7 +150,7 @@ def flat(
     """
     from acquire.calibrate import columns
 
-    known, exposure = _known(out), _exposure(recording, first_line, lines, begin, end)
+    known, exposure = _known(out), _exposure(recording, first_line, lines, begin, end, out)
     with stage_progress(f"reading {recording}") as advance:
         found = columns.flat(exposure, known, smooth=smooth, progress=advance)
     _keep(out, found, json=json)
@@ -173,7 +174,7 @@ def transfer(
     from acquire.calibrate import transfer as method
 
     known = _known(out)
-    exposures = [_exposure(each, None, None, None, None) for each in recordings]
+    exposures = [_exposure(each, None, None, None, None, out) for each in recordings]
     with stage_progress("reading the flats") as advance:
         found = method.transfer(exposures, known, progress=advance)
     _keep(out, found, json=json)
@@ -198,7 +199,7 @@ def orientation(
     """
     from acquire.calibrate import target
 
-    known, exposure = _known_or_new(out, recording), _exposure(recording, first_line, lines, begin, end)
+    known, exposure = _known_or_new(out, recording), _exposure(recording, first_line, lines, begin, end, out)
     with stage_progress("comparing the arms' images"):
         found = target.orientation(exposure, known)
     _keep(out, found, json=json, new=True)
@@ -224,7 +225,7 @@ def align(
     """
     from acquire.calibrate import target
 
-    known, exposure = _known_or_new(out, recording), _exposure(recording, first_line, lines, begin, end)
+    known, exposure = _known_or_new(out, recording), _exposure(recording, first_line, lines, begin, end, out)
     with stage_progress("aligning the arms' images"):
         behind = exposure.recording.fibre is not None
         found = (target.tile_alignments if behind else target.alignment)(exposure, known)
@@ -252,7 +253,7 @@ def psf(
     """
     from acquire.calibrate import psf as method
 
-    known, exposure = _known_or_new(out, recording), _exposure(recording, first_line, lines, begin, end)
+    known, exposure = _known_or_new(out, recording), _exposure(recording, first_line, lines, begin, end, out)
     with stage_progress("measuring the edges"):
         found = method.psf(exposure, known)
     _keep(out, found, json=json, new=True)
@@ -278,7 +279,7 @@ def veil(
     """
     from acquire.calibrate import veil as method
 
-    known, exposure = _known_or_new(out, recording), _exposure(recording, first_line, lines, begin, end)
+    known, exposure = _known_or_new(out, recording), _exposure(recording, first_line, lines, begin, end, out)
     with stage_progress("measuring the veil"):
         found = method.veil(exposure, known)
     _keep(out, found, json=json, new=True)
@@ -373,15 +374,24 @@ def check(
 
 
 def _exposure(
-    recording: str, first_line: int | None, lines: int | None, begin: str | None, end: str | None
+    recording: str,
+    first_line: int | None,
+    lines: int | None,
+    begin: str | None,
+    end: str | None,
+    out: str | None = None,
 ) -> Exposure:
+    """Open the lines of a recording. Raises UsageError for another instrument than the calibration's."""
     from acquire.calibrate.exposure import open_exposure
     from acquire.store import open_recording
 
     if begin is not None or end is not None:
         # Numbers are left to `open_exposure`, which knows what a calibration needs.
         first_line, lines = lines_between(open_recording(recording), first_line, lines, begin, end)
-    return open_exposure(recording, first_line, lines)
+    found = open_exposure(recording, first_line, lines)
+    if out is not None:
+        refuse_other(out, [found])
+    return found
 
 
 def _known(place: str) -> Calibration:

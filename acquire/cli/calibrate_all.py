@@ -135,7 +135,7 @@ def calibrate_all(
     optional = [step for step, asked in wanted if asked or step.name in (only or ())]
     steps += optional
     found: list[Finding] = []
-    with instrument(socket, directory) as daemon:
+    with instrument(socket, directory, out) as daemon:
         geometry = daemon.setup().config["geometry"]
         rows = geometry["stages"] * geometry["substeps"]
         if optional:  # refuse before the first recording if the rig cannot measure the optics
@@ -209,7 +209,7 @@ def _step(
         if ask:
             wait_for_enter()
         try:
-            exposure = record(daemon, step.name, directory, lines, code=step.code)
+            exposure = record(daemon, step.name, directory, lines, out, code=step.code)
             found = []
             evaluations = _evaluations(exposure)
             for name in _wanted(step, out):

@@ -2,13 +2,21 @@
 
 from __future__ import annotations
 
+import contextlib
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from acquire.calibrate.guide import DELAY, MOST_LINES
-from acquire.cli.calibrate_live import instrument, print_finding, record, save_finding, wait_for_enter
+from acquire.cli.calibrate_live import (
+    instrument,
+    print_finding,
+    record,
+    refuse_other,
+    save_finding,
+    wait_for_enter,
+)
 from acquire.cli.control import SocketOption
 from acquire.cli.output import JsonFlag, note, print_json
 from acquire.cli.places import calibration_place
@@ -68,8 +76,9 @@ def delay(
     if recordings:
         # Whole, whatever it lacks: these recordings are what the user wants to be evaluated.
         exposures, whole = [open_exposure(each) for each in recordings], True
+        refuse_other(out, exposures)
     else:
-        exposures, whole = _swept(directory, lines, socket, ask=not yes)
+        exposures, whole = _swept(out, directory, lines, socket, ask=not yes)
     found = _found(out, exposures, whole=whole)
     if json:
         late = found.quantities["light_late_ticks"]
@@ -81,7 +90,7 @@ def delay(
 
 
 def _swept(
-    directory: Path, lines: int | None, socket: Path | None, *, ask: bool
+    out: str, directory: Path, lines: int | None, socket: Path | None, *, ask: bool
 ) -> tuple[list[Exposure], bool]:
     """Record the sweep until Ctrl-C; return its exposures, and whether the sweep is complete."""
     from acquire.calibrate import delay_sweep as sweep
@@ -89,13 +98,16 @@ def _swept(
     from acquire.cli.progress import ProgressDisplay
     from acquire.daemon.messages import TriggerDelays
 
-    note(f"delay: {DELAY.prepare}")
-    if ask:
-        wait_for_enter()
     finishing = "ending with the recordings made so far"
-    with instrument(socket, directory) as daemon, stop_on_interrupt(finishing) as stop_requested:
+    with contextlib.ExitStack() as held:
+        # Before the scene is put in, and Enter pressed: this may refuse the rig.
+        daemon = held.enter_context(instrument(socket, directory, out))
+        note(f"delay: {DELAY.prepare}")
+        if ask:
+            wait_for_enter()
+        stop_requested = held.enter_context(stop_on_interrupt(finishing))
         # the first recording gives the rough delay, around which the sweep is laid
-        first = record(daemon, "delay", directory, sweep.FIRST_LINES)
+        first = record(daemon, "delay", directory, sweep.FIRST_LINES, out)
         setting, point = sweep.setting_of(first), sweep.point_of(first)
         late = sweep.first_sight(point, setting.substep_ticks)
         lines = lines or sweep.lines_for(point, first.lines, setting.substep_ticks)
@@ -109,7 +121,7 @@ def _swept(
                 if stop_requested.is_set():
                     break
                 delays = TriggerDelays(light_lead=each.light_lead_ticks, a=each.a_ticks, b=each.b_ticks)
-                exposures.append(record(daemon, "delay", directory, lines, delays=delays))
+                exposures.append(record(daemon, "delay", directory, lines, out, delays=delays))
     return exposures, len(exposures) == 1 + len(settings)
 
 

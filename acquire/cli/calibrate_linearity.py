@@ -2,13 +2,21 @@
 
 from __future__ import annotations
 
+import contextlib
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from acquire.calibrate.guide import LINEARITY, MOST_LINES, RAMP_LINES
-from acquire.cli.calibrate_live import instrument, print_finding, record, save_finding, wait_for_enter
+from acquire.cli.calibrate_live import (
+    instrument,
+    print_finding,
+    record,
+    refuse_other,
+    save_finding,
+    wait_for_enter,
+)
 from acquire.cli.control import SocketOption
 from acquire.cli.output import JsonFlag, note, print_json, say
 from acquire.cli.places import calibration_place
@@ -64,6 +72,7 @@ def linearity(
 
     if recordings:
         exposures = [open_exposure(each) for each in recordings]
+        refuse_other(out, exposures)
     else:
         exposures = _ramp(out, directory, lines, socket, ask=not yes)
     with stage_progress("evaluating the ramp") as advance:
@@ -97,18 +106,20 @@ def _ramp(out: str, directory: Path, lines: int, socket: Path | None, *, ask: bo
 
     # Before the recordings, not after: without a dark they could not be evaluated.
     offset = offset_of(open_calibration(out), "linearity")
-    note(f"linearity: {LINEARITY.prepare}")
-    if ask:
-        wait_for_enter()
-
     finishing = "ending with the recordings made so far"
-    with instrument(socket, directory) as daemon, stop_on_interrupt(finishing) as stop_requested:
-        whole = record(daemon, "ramp", directory, lines, code="steady")
+    with contextlib.ExitStack() as held:
+        # Before the scene is put in, and Enter pressed: this may refuse the rig.
+        daemon = held.enter_context(instrument(socket, directory, out))
+        note(f"linearity: {LINEARITY.prepare}")
+        if ask:
+            wait_for_enter()
+        stop_requested = held.enter_context(stop_on_interrupt(finishing))
+        whole = record(daemon, "ramp", directory, lines, out, code="steady")
         ticks = lit_ticks(whole)[1]
 
         def level(lit: int) -> Exposure:
             window = TriggerWindow(open=0, close=lit)
-            return record(daemon, "ramp", directory, lines, code="steady", window=window)
+            return record(daemon, "ramp", directory, lines, out, code="steady", window=window)
 
         # First the dimmest: the levels in between follow from it.
         dimmest = level(max(1, ticks // PARTS))

@@ -14,7 +14,7 @@ from acquire.errors import DataError, StateError, UsageError
 from acquire.text import counted
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Mapping
+    from collections.abc import Callable, Iterable, Iterator, Mapping
     from pathlib import Path
 
     from acquire.calibrate.calibration import Calibration, Finding
@@ -36,8 +36,11 @@ MOST_LOST = 0.1
 
 
 @contextmanager
-def instrument(socket: Path | None, directory: Path) -> Iterator[Client]:
-    """Connect to an idle or armed daemon, create ``directory``, and restore the daemon's state at the end."""
+def instrument(socket: Path | None, directory: Path, out: str) -> Iterator[Client]:
+    """Connect to an idle or armed daemon, create ``directory``, and restore the daemon's state at the end.
+
+    Raises UsageError if the calibration at ``out`` is of another instrument.
+    """
     from acquire.cli.progress import waiting_printer
     from acquire.client import Client
     from acquire.store.refusals import refused
@@ -50,6 +53,7 @@ def instrument(socket: Path | None, directory: Path) -> Iterator[Client]:
             raise StateError(
                 f"the daemon is {status.state}", possible="idle or armed", hint="acquire stop, or disarm"
             )
+        _refuse_other_rig(daemon, out, armed=False)
         # Only now, so that a daemon in another state leaves no empty directory.
         with refused(directory, "created"):
             directory.mkdir(parents=True, exist_ok=True)
@@ -68,6 +72,7 @@ def record(
     name: str,
     directory: Path,
     lines: int,
+    out: str,
     *,
     code: LightCode = "rig",
     delays: TriggerDelays | None = None,
@@ -75,7 +80,8 @@ def record(
 ) -> Exposure:
     """Arm with the given light and timing, record ``NAME-1.zarr`` (or the next free number) and disarm.
 
-    A recording that lost lines, as on a busy host, is repeated. Raises DataError if every attempt lost lines.
+    A recording that lost lines, as on a busy host, is repeated. Raises DataError if every attempt lost lines,
+    and UsageError, before it records, for cameras of which the calibration at ``out`` is not.
     """
     from acquire.calibrate.exposure import open_exposure
     from acquire.client import SEALED
@@ -88,6 +94,8 @@ def record(
         # Without a calibration: the rig may name the very one that is being made, and that does not exist
         # yet.
         daemon.arm(code=code, calibration="none", delays=delays, window=window)
+        # Gains, directions and the like are known only now.
+        _refuse_other_rig(daemon, out, armed=True)
         path = free_path(directory, name)
         status = daemon.start(path, lines=lines)
         # An arm that has just been armed may show no rate yet.
@@ -118,21 +126,54 @@ def free_path(directory: Path, name: str) -> Path:
     return path
 
 
+def refuse_other(out: str, exposures: Iterable[Exposure]) -> None:
+    """Raise UsageError for recordings of another instrument than an existing calibration at ``out``."""
+    if (known := _known_at(out)) is not None:
+        for each in exposures:
+            known.check_same(each.instrument, str(each.recording), out)
+
+
+def _refuse_other_rig(daemon: Client, out: str, *, armed: bool) -> None:
+    """Raise UsageError if the calibration at ``out`` is of another instrument than the daemon's."""
+    from pydantic import ValidationError
+
+    from acquire.calibrate.choose import check_rig
+    from acquire.config import RigConfig
+
+    if (known := _known_at(out)) is None:
+        return
+    setup = daemon.setup()
+    try:
+        config = RigConfig.model_validate(setup.config)
+    except ValidationError:
+        return  # a daemon of another version: its recordings will tell
+    # Before, they are what the cameras were when they were armed last.
+    devices = setup.devices if armed else []
+    reported = {each.device.removeprefix("camera "): each.settings for each in devices}
+    check_rig(known, out, config, reported)
+
+
+def _known_at(out: str) -> Calibration | None:
+    from acquire.calibrate import open_calibration
+    from acquire.store.source import source_of
+
+    return open_calibration(out) if source_of(out).exists() else None
+
+
 def save_finding(out: str, exposure: Exposure, evaluate: Callable[[Calibration], Finding]) -> Finding:
     """Evaluate an exposure and add the result to the calibration at ``out``.
 
     Raises UsageError if the exposure does not determine the orientation.
     """
-    from acquire.calibrate import Calibration, open_calibration
+    from acquire.calibrate import Calibration
     from acquire.calibrate.file import change_calibration
-    from acquire.store.source import source_of
 
-    known = open_calibration(out) if source_of(out).exists() else Calibration(exposure.instrument)
-    found = evaluate(known)
+    begun = Calibration(exposure.instrument)
+    found = evaluate(_known_at(out) or begun)
     if found.step == "orientation" and found.orientation is None:
         raise UsageError(f"orientation: {found.warnings[0]}")
     # Of what is there now: another command may have added a step during the evaluation.
-    change_calibration(out, lambda now: now.with_step(found), new=Calibration(exposure.instrument))
+    change_calibration(out, lambda now: now.with_step(found), new=begun)
     return found
 
 

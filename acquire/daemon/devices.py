@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 from typing import TYPE_CHECKING, Any
 
+from acquire.calibrate.exposure import camera_of
 from acquire.daemon.facts import DeviceFacts
 from acquire.trigger.driver import TriggerDriver
 
@@ -34,7 +35,7 @@ class KnownDevices:
         for arm, facts in sorted(cameras.items()):
             said = facts.get("identity", {})
             known = {key: str(said.get(key, "")) for key in ("vendor", "model", "serial", "firmware")}
-            found.append(DeviceFacts(device=f"camera {arm}", **known))
+            found.append(DeviceFacts(device=f"camera {arm}", settings=camera_of(facts), **known))
         self._facts = tuple(found)
 
 

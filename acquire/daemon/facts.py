@@ -92,6 +92,10 @@ class DeviceFacts(Message):
     firmware: Text = ""
     board: Text = Field(default="", description="of a trigger with this project's gateware")
     port: Text = Field(default="", description="where the trigger is connected")
+    settings: dict[str, Any] = Field(
+        default={},
+        description="of a camera: what it reported of that on which its lines depend, such as its gain",
+    )
 
 
 class Setup(Message):

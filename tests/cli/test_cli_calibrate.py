@@ -89,6 +89,33 @@ def test_impossible_requests_are_refused_and_leave_nothing_behind(
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.parametrize(
+    ("step", "recordings"),
+    [
+        ("dark", ["flat"]),
+        ("transfer", ["flat", "other"]),
+        ("psf", ["flat"]),
+        ("delay", ["flat"]),
+        ("linearity", ["flat", "other"]),
+    ],
+)
+def test_another_instruments_recording_is_refused_before_it_is_evaluated(
+    cli: Cli, taken: dict[str, Path], tmp_path: Path, step: str, recordings: list[str]
+) -> None:
+    """The evaluation would refuse these with an error of its own, after it has read them."""
+    cal, other = tmp_path / "cal.zarr", tmp_path / "other.zarr"
+    there = record(
+        tmp_path / "dark.zarr", white(effects=EFFECTS), "dark", 64, **{"cameras.b.serial": "OTHER"}
+    )
+    assert cli("calibrate", "dark", there, "--out", cal).code == 0
+    record(other, white(effects=EFFECTS), "flat", 64, **{"cameras.b.serial": "OTHER"})
+    given = [other if name == "other" else taken[name] for name in reversed(recordings)]
+    answer = cli("calibrate", step, *given, "--out", cal)
+    assert answer.code == 2
+    assert f"{taken['flat']} is of another instrument than {cal}: camera b: serial is SIM-B" in answer.err
+    assert "--out with another name" in answer.err
+
+
 def test_an_undetermined_orientation_is_not_saved(cli: Cli, tmp_path: Path) -> None:
     plain = record(tmp_path / "plain.zarr", white(0.4, NOISE), "target", 256)
     answer = cli("calibrate", "orientation", plain, "--out", tmp_path / "cal.zarr")

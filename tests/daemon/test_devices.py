@@ -31,13 +31,14 @@ def test_a_device_has_what_it_said_of_itself(tmp_path: Path) -> None:
     known = KnownDevices()
     assert known.facts == []
     with contextlib.closing(Rig(rig_config(tmp_path))) as rig:
-        known.note(rig.trigger, {"b": {"identity": CAMERA, "Width": 8}, "a": {}})
+        known.note(rig.trigger, {"b": {"identity": CAMERA, "Width": 8, "Gain": 2.0}, "a": {}})
         trigger, a, b = known.facts
         assert (trigger.device, trigger.port) == ("trigger", "simulated trigger")
         assert trigger.board in trigger.model
         assert trigger.firmware == rig.trigger.identify().firmware != ""
     assert (a.device, a.model, a.serial) == ("camera a", "", "")
     assert b.model_dump(include=set(CAMERA)) == CAMERA
+    assert (a.settings, b.settings) == ({}, {"serial": "S-1", "Gain": 2.0})
 
 
 def test_a_driver_that_cannot_say_what_it_drives_ends_no_run() -> None:

@@ -10,13 +10,14 @@ import signal
 import subprocess
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from live_daemon import COMMAND, Daemon
 from waiting import until
 
-from acquire.calibrate import open_calibration
+from acquire.calibrate import Calibration, Finding, Instrument, Measured, open_calibration, save_calibration
 from acquire.calibrate.sheet import Sheet
 
 M, S, FINER = 64, 3, 8
@@ -156,6 +157,35 @@ def test_an_unsuitable_rig_is_refused_before_anything_is_recorded(
         assert why in refused.err
         assert f"leave {why.partition(':')[0]} out" in refused.err
         assert not list((tmp_path / "calibration-recordings").iterdir())
+
+
+@pytest.mark.parametrize(
+    ("own", "armed", "why"),
+    [
+        ({"stages": 12}, False, "stages M is 8 instead of 12"),
+        ({"cameras": {"b": {"serial": "C"}}}, False, "camera b: serial is B instead of C"),
+        ({"cameras": {"a": {"OffsetX": 16}}}, True, "camera a: OffsetX is 0 instead of 16"),
+    ],
+)
+@pytest.mark.parametrize("words", [("all", "--only", "dark"), ("delay",), ("linearity",)], ids=" ".join)
+def test_another_instruments_calibration_is_refused_before_anything_is_recorded(
+    tmp_path: Path, own: dict[str, Any], armed: bool, why: str, words: tuple[str, ...]
+) -> None:
+    """It was refused after minutes of recording and evaluating. Some settings are known only once armed."""
+    facts = {"stages": 8, "substeps": 2, "substep_s": 5e-5, "layout": "dual", "cameras": {}} | own
+    instrument, cal = Instrument.model_validate(facts), tmp_path / "cal.zarr"
+    columns = Measured(np.zeros((2, instrument.stages)), np.ones((2, instrument.stages)))
+    found = Finding("dark", instrument, {"offset_dn": columns, "noise_dn": columns})
+    save_calibration(cal, Calibration(instrument).with_step(found))
+    with contextlib.closing(Daemon(tmp_path)) as daemon:
+        refused = daemon("calibrate", *words, "--yes", "--out", cal)
+        assert refused.code == 2
+        assert f"rig small is of another instrument than {cal}: {why}" in refused.err
+        assert "--out with another name" in refused.err
+        assert not list(tmp_path.glob("calibration-recordings/*"))
+        with daemon.client() as client:
+            assert bool(client.setup().devices) == armed
+            assert client.status().state == "idle"
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
