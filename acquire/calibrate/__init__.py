@@ -12,7 +12,7 @@
                 target (orientation, align) with field, psf, veil; still: a target's image from one arm;
                 sheet: a drawing that serves for all four
     around them checks (does the recording suit?), guide (what to put in front of the lens), words
-    afterwards  choose (which calibration), check (is it still valid?)
+    afterwards  choose (which calibration), check (is it still valid?), forget (a step again)
 
 A calibration holds measurements and nothing else, and a property that was not measured is not corrected.
 Lines on disk are never altered.

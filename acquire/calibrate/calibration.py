@@ -264,7 +264,7 @@ class Calibration:
             self,
             quantities={**self.quantities, **found.quantities},
             # from all steps anew: a step that is repeated can make columns usable again
-            usable=_usable(steps, self.instrument.columns),
+            usable=usable_of(steps, self.instrument.columns),
             # one that was not clear is None, and replaces nothing
             orientation=found.orientation or self.orientation,
             alignment=found.alignment or self.alignment,
@@ -282,7 +282,7 @@ class Calibration:
                 f"the step {step!r} was not done", possible=", ".join(self.steps) or "none was done yet"
             )
         facts = self.steps[step]
-        usable = _usable({step: facts}, self.instrument.columns)
+        usable = usable_of({step: facts}, self.instrument.columns)
         return Finding(
             step,
             self.instrument,
@@ -360,7 +360,7 @@ def unusable_columns(usable: NDArray[np.bool_]) -> dict[str, list[int]]:
     return {arm: np.flatnonzero(~row).tolist() for arm, row in zip(ARMS, usable, strict=True)}
 
 
-def _usable(steps: Mapping[str, dict[str, Any]], columns: int) -> NDArray[np.bool_] | None:
+def usable_of(steps: Mapping[str, dict[str, Any]], columns: int) -> NDArray[np.bool_] | None:
     """Return the columns (arm, column) that no step excluded; None if no step examined them."""
     excluded = [step["unusable_columns"] for step in steps.values() if "unusable_columns" in step]
     if not excluded:

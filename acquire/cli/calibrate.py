@@ -9,6 +9,7 @@ import typer
 
 from acquire.cli.calibrate_all import calibrate_all
 from acquire.cli.calibrate_delay import delay
+from acquire.cli.calibrate_forget import forget
 from acquire.cli.calibrate_linearity import linearity
 from acquire.cli.calibrate_live import refuse_other
 from acquire.cli.calibrate_sheet import sheet
@@ -64,6 +65,7 @@ def register(app: typer.Typer) -> None:
         sheet,
         show,
         check,
+        forget,
     ):
         group.command()(command)
     group.command("all")(calibrate_all)

@@ -55,6 +55,31 @@ def test_step_by_step_to_a_page(cli: Cli, taken: dict[str, Path], tmp_path: Path
     assert answer.out.count("holds") == 6
 
 
+def test_a_step_is_forgotten(cli: Cli, taken: dict[str, Path], tmp_path: Path) -> None:
+    """A wrong veil, or blur, stayed in the calibration for ever: a step could only be replaced."""
+    cal = tmp_path / "cal.zarr"
+    for step in ("dark", "flat", "transfer"):
+        assert cli("calibrate", step, taken["dark" if step == "dark" else "flat"], "--out", cal).code == 0
+    answer = cli("calibrate", "forget", "transfer", "--out", cal)
+    assert answer.code == 0, answer.err
+    assert "forgotten  transfer" in answer.out
+    assert "dark, flat" in answer.out
+    shown = cli("calibrate", "show", cal).out
+    assert "gain" in shown
+    assert "DN per electron" not in shown
+    for words, why in (
+        (("transfer",), "has no step 'transfer'"),
+        (("dark",), "nothing would be left"),
+        ((), "STEP"),
+    ):
+        refused = cli("calibrate", "forget", *words, "--out", cal)
+        assert refused.code == 2
+        assert why in refused.err
+    assert cli("calibrate", "transfer", taken["flat"], "--out", cal).code == 0
+    gone = cli("calibrate", "forget", "flat", "transfer", "--out", cal, "--json").json
+    assert gone == {"calibration": str(cal), "forgotten": ["flat", "transfer"], "steps": ["dark"]}
+
+
 def test_a_failed_check_names_what_has_changed(cli: Cli, taken: dict[str, Path], tmp_path: Path) -> None:
     cal = tmp_path / "cal.zarr"
     assert cli("calibrate", "align", taken["target"], "--out", cal, "--json").code == 0
