@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING
 from pydantic import TypeAdapter
 
 from acquire.place import home
+from acquire.store.files import Publisher
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
@@ -69,13 +70,10 @@ def remember(found: Iterable[Learned], path: Path | None = None) -> Path:
     }
     path.parent.mkdir(parents=True, exist_ok=True)
     document = {"version": VERSION, "learned": [asdict(each) for each in known.values()]}
-    # It is renamed when complete: a program that reads meanwhile finds the old file or the new one.
+    # It is renamed when complete: a program that reads meanwhile, or after a power cut, finds the old file or
+    # the new one.
     part = path.with_name(f".{path.name}.{secrets.token_hex(4)}.partial")
-    try:
-        part.write_text(json.dumps(document, indent=1) + "\n", encoding="utf-8")
-        part.replace(path)
-    finally:
-        part.unlink(missing_ok=True)  # what a full disk has left
+    Publisher(part).replace(path, (json.dumps(document, indent=1) + "\n").encode(), durable=True)
     return path
 
 

@@ -15,6 +15,7 @@ from pathlib import Path
 from acquire.errors import DeviceError
 from acquire.place import home
 from acquire.sim.gentl.layout import header
+from acquire.store.files import DISK
 from acquire.store.refusals import refused
 
 SOURCE = Path(__file__).with_name("producer.c")
@@ -86,6 +87,8 @@ def _compile(found: str, target: Path) -> None:
                 f"{found} failed to compile the producer: {done.stderr.strip()[-2000:]}",
                 hint="CC in the environment for another compiler",
             )
+        # Its bytes before its name: after a power cut an empty file would count as compiled from then on.
+        DISK.sync_tree(directory)
         made.replace(target)
 
 
