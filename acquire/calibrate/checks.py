@@ -166,7 +166,16 @@ def refuse_texture(
 
 
 def refuse_clipped(exposure: Exposure, found: Moments) -> None:
-    """Raise UsageError for dark lines that reach 0."""
+    """Raise UsageError for dark lines that reach 0, or white."""
+    # by the median, so that a few hot columns do not refuse a dark
+    saturated = np.median(found.saturated, axis=1).max()
+    if saturated > MOST_SATURATED:
+        raise UsageError(
+            f"{exposure.recording} is not dark: {saturated:.0%} of its samples are saturated",
+            possible="dark lines a few percent of white above 0",
+            hint="switch off what lights the scene, the room or a light that stays on (acquire trigger "
+            "blink), and record again",
+        )
     clipped = found.at_zero > MOST_AT_ZERO
     if clipped.any():
         raise UsageError(

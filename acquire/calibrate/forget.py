@@ -30,7 +30,10 @@ def without(known: Calibration, steps: Iterable[str], place: str) -> Calibration
     going, why = _with_dependents(known, asked)
     if len(going) == len(known.steps):
         text = "; ".join(why) or "a calibration without a step cannot be written"
-        raise UsageError(f"nothing would be left of {place}: {text}", hint=f"rm -r {place}")
+        raise UsageError(
+            f"nothing would be left of {place}: {text}",
+            hint=f"measure it again, which replaces it; or rm -r {place}",
+        )
     if why:
         names = " ".join(step for step in known.steps if step in going)
         raise UsageError(

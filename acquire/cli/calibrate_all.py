@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import contextmanager
 from dataclasses import replace
 from functools import reduce
 from pathlib import Path
@@ -155,13 +156,28 @@ def calibrate_all(
                 )
         _refuse_out_of_order(steps, out)
         _warn_of_delays(out, daemon.setup().config["trigger"])
-        for step in steps:
+        for number, step in enumerate(steps):
             count = lines or lines_of(step, rows) or LINES
-            found += _step(daemon, step, out, directory, count, ask=not yes, quiet=json)
+            with _telling_what_is_left(steps, number, out):
+                found += _step(daemon, step, out, directory, count, ask=not yes, quiet=json)
     if json:
         print_json({"calibration": out, "steps": {each.step: each.facts for each in found}})
     else:
         say(f"saved in  {out}; to plot it: acquire calibrate show {out} --out DIR")
+
+
+@contextmanager
+def _telling_what_is_left(steps: list[Step], number: int, out: str) -> Iterator[None]:
+    """If a step fails or is interrupted, say which ones were saved before it, and how to continue."""
+    try:
+        yield
+    except BaseException:
+        if number:
+            done = ", ".join(step.name for step in steps[:number])
+            left = "".join(f" --only {step.name}" for step in steps[number:])
+            black = " --black" if any("veil" in step.tries for step in steps[number:]) else ""
+            note(f"{out} has {done}; to continue: acquire calibrate all{left}{black} --out {out}")
+        raise
 
 
 def _refuse_out_of_order(steps: list[Step], out: str) -> None:

@@ -50,9 +50,8 @@ def instrument(socket: Path | None, directory: Path, out: str) -> Iterator[Clien
     with Client(socket, waiting_printer()) as daemon:
         status = daemon.status()
         if status.state not in ("idle", "armed"):
-            raise StateError(
-                f"the daemon is {status.state}", possible="idle or armed", hint="acquire stop, or disarm"
-            )
+            now = f"{status.state} {status.recording.path if status.recording else ''}".strip()
+            raise StateError(f"the daemon is {now}", possible="idle or armed", hint="acquire stop, or disarm")
         _refuse_other_rig(daemon, out, armed=False)
         # Only now, so that a daemon in another state leaves no empty directory.
         with refused(directory, "created"):

@@ -141,6 +141,6 @@ def test_an_absent_step_and_the_last_one_are_refused(tmp_path: Path) -> None:
     assert refused.value.possible == "dark, flat"
     with pytest.raises(UsageError, match=r"nothing would be left of cal\.zarr: flat was") as refused:
         without(known, ["dark"], "cal.zarr")
-    assert refused.value.hint == "rm -r cal.zarr"
+    assert refused.value.hint == "measure it again, which replaces it; or rm -r cal.zarr"
     with pytest.raises(PlaceError, match="does not exist"):
         change_calibration(tmp_path / "none.zarr", lambda now: without(now, ["veil"], "none.zarr"))

@@ -200,6 +200,14 @@ def test_room_light_in_a_dark_is_reported(tmp_path: Path) -> None:
     assert "ambient light takes this part" in found.warnings[0]
 
 
+def test_a_dark_that_is_saturated_is_refused(tmp_path: Path) -> None:
+    """Offsets of 4095 DN without noise were saved, with the warning of a room that is a little bright."""
+    effects = [*NOISE, {"kind": "stray_light", "ambient": 1.0}]
+    path = record(tmp_path / "dark.zarr", white(effects=effects), "dark")
+    with pytest.raises(UsageError, match="is not dark: 100% of its samples are saturated"):
+        dark(open_exposure(path))
+
+
 def test_a_flat_of_a_target_is_refused(tmp_path: Path, known: Calibration) -> None:
     """Its texture was taken for gains that differ by 25 %."""
     path = record(tmp_path / "flat.zarr", dots(tmp_path, ALL), "flat")

@@ -76,6 +76,9 @@ def test_blur_and_veil_are_measured_last_and_earlier_results_are_kept(tmp_path: 
         assert nothing_there.code == 2
         assert "the blur of the optics of arm a cannot be measured" in nothing_there.err
         assert "a square or a checkerboard, slightly turned" in nothing_there.err
+        assert (
+            f"{cal} has dark; to continue: acquire calibrate all --only psf --out {cal}" in nothing_there.err
+        )
         assert list(open_calibration(cal).steps) == ["dark"]
 
         put(tmp_path, checkerboard(8.0))
