@@ -249,6 +249,15 @@ class Calibration:
                 hint="--out with another name",
             )
 
+    def is_after(self, step: str, base: str) -> bool:
+        """Return whether both steps were done, and ``step`` not before ``base``."""
+        if step not in self.steps or base not in self.steps:
+            return False
+        dates = [facts["made"] for facts in (self.steps[base], self.steps[step]) if "made" in facts]
+        made = [datetime.fromisoformat(date) for date in dates]
+        # one that was never dated may have been
+        return len(made) < 2 or made[0] <= made[1]
+
     def with_step(self, found: Finding) -> Calibration:
         """Return the calibration with a step's result in place of earlier ones.
 
@@ -260,9 +269,13 @@ class Calibration:
         if found.usable is not None:
             step["unusable_columns"] = unusable_columns(found.usable)
         steps = {**self.steps, found.step: step}
+        before = dict(self.quantities)
+        if found.step == "align":
+            # a lens's light that is not seen any more
+            before.pop("shading", None)
         return replace(
             self,
-            quantities={**self.quantities, **found.quantities},
+            quantities={**before, **found.quantities},
             # from all steps anew: a step that is repeated can make columns usable again
             usable=usable_of(steps, self.instrument.columns),
             # one that was not clear is None, and replaces nothing

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from datetime import datetime
 from typing import TYPE_CHECKING
 
 from acquire.calibrate.calibration import FOUND_BY, usable_of
@@ -73,34 +72,21 @@ def _links(known: Calibration) -> list[tuple[str, str, str]]:
     steps, found = known.steps, []
     if "dark" in steps:
         needing = [step for step in NEEDS_DARK if step in steps]
-        needing += ["veil"] if _after(known, "veil", "dark") else []
+        needing += ["veil"] if known.is_after("veil", "dark") else []
         found += [("dark", step, f"{step} was measured with the offsets of dark") for step in needing]
     if curve_of(known) is not None:
         found += [
             ("linearity", step, f"{step} was measured with the curve of linearity")
             for step in ("flat", "transfer", "veil")
-            if _after(known, step, "linearity")
+            if known.is_after(step, "linearity")
         ]
     if "orientation" in steps and "align" in steps:
         found.append(("orientation", "align", "align was measured in this orientation"))
     corrected = steps.get("align", {}).get("corrected", [])
-    if corrected and _after(known, "align", "flat"):
+    if corrected and known.is_after("align", "flat"):
         found.append(
             ("flat", "align", f"align has measured {' and '.join(corrected)} with the gains of flat")
         )
         if own := " and ".join(name for name in corrected if name in FOUND_BY["flat"]):
             found.append(("align", "flat", f"align has replaced {own} of flat by its own"))
     return found
-
-
-def _after(known: Calibration, step: str, base: str) -> bool:
-    """Return whether both were done, and the step not before the other one."""
-    if step not in known.steps or base not in known.steps:
-        return False
-    made = [
-        datetime.fromisoformat(facts["made"])
-        for facts in (known.steps[base], known.steps[step])
-        if "made" in facts
-    ]
-    # One that was never dated may have been.
-    return len(made) < 2 or made[0] <= made[1]

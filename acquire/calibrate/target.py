@@ -302,12 +302,15 @@ def _shading(known: Calibration, exposure: Exposure, match: Match) -> dict[str, 
 
 def _corrected(known: Calibration, quantities: Mapping[str, Measured]) -> list[str]:
     """Return, in words, what differs from the values of the flat, not only in its uncertainty."""
-    changed = [
+    changed = {
         name
-        for name, each in sorted(quantities.items())
+        for name, each in quantities.items()
         if name not in known.quantities or not np.array_equal(each.value, known.quantities[name].value)
-    ]
-    return ["the lens's light" if name == "shading" else name for name in changed]
+    }
+    if known.is_after("align", "flat"):
+        # An earlier target has corrected the same flat, and this one only the rest.
+        changed |= {"gain", "balance"}.intersection(known.steps["align"].get("corrected", ()))
+    return ["the lens's light" if name == "shading" else name for name in sorted(changed)]
 
 
 def _balance(known: Calibration, match: Match) -> dict[str, Measured]:

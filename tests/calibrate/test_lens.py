@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from instruments import COLUMNS, NOISE, dots, record, white
 
-from acquire.calibrate import Calibration, calibrated, open_calibration, save_calibration
+from acquire.calibrate import Calibration, Finding, calibrated, open_calibration, save_calibration
 from acquire.calibrate.apply import belongs_to_flat
 from acquire.calibrate.check import check
 from acquire.calibrate.choose import corrected
@@ -105,6 +105,24 @@ def test_a_repeated_flat_says_that_the_target_comes_next(taken: dict[str, Path],
     assert "repeat align" in again.warnings[-1]
     assert not belongs_to_flat(replace(lens, steps={**lens.steps, "flat": {"made": "2020-01-01T00:00"}}))
     assert "arm B lies" in found_facts(alignment(open_exposure(taken["target"]), lens.with_step(again)))
+
+
+def test_what_an_earlier_target_has_corrected_stays_known(
+    taken: dict[str, Path], lens: Calibration, tmp_path: Path
+) -> None:
+    """A second target corrects nothing more: a flat that replaced the corrected one then did so silently."""
+    first = lens.steps["align"]["corrected"]
+    assert "gain" in first
+    again = lens.with_step(alignment(open_exposure(taken["target"]), lens))
+    assert set(first) <= set(again.steps["align"]["corrected"])
+    assert "repeat align" in flat(open_exposure(taken["flat"]), again).warnings[-1]
+
+
+def test_a_fall_of_the_light_that_is_not_seen_any_more_is_forgotten(lens: Calibration) -> None:
+    """It stayed, with the advice to repeat the step that had just been repeated."""
+    plain = lens.with_step(Finding("align", lens.instrument, alignment=lens.alignment))
+    assert "shading" not in plain.quantities
+    assert LENS not in known_facts(plain)
 
 
 def test_a_cut_file_names_what_is_damaged(lens: Calibration, tmp_path: Path) -> None:
