@@ -9,6 +9,7 @@ from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
 from acquire.cli.output import note, print_facts, print_warning
+from acquire.daemon.states import State, refusal
 from acquire.daemon.who import LONGEST, WHO
 from acquire.errors import DataError, StateError, UsageError
 from acquire.text import counted
@@ -49,6 +50,8 @@ def instrument(socket: Path | None, directory: Path, out: str) -> Iterator[Clien
     WHO.set(os.environ.get(BY, "")[:LONGEST])
     with Client(socket, waiting_printer()) as daemon:
         status = daemon.status()
+        if status.state is State.FAULTED:
+            raise refusal("calibrating is impossible while the daemon is faulted", status.state, status.fault)
         if status.state not in ("idle", "armed"):
             now = f"{status.state} {status.recording.path if status.recording else ''}".strip()
             raise StateError(f"the daemon is {now}", possible="idle or armed", hint="acquire stop, or disarm")

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Protocol
 from acquire.camera.gauge import Gauge
 from acquire.camera.live import TURN_S, ImagePart, LiveCamera
 from acquire.cli.camera_bench import OPEN_S, CameraBench
+from acquire.daemon.states import State, refusal
 from acquire.errors import NoDaemonError, StateError, UsageError
 from acquire.lines import ARMS
 from acquire.stream.peek import Peek
@@ -113,6 +114,8 @@ class RingSource:
         from acquire.web.places import shape_of
 
         status, setup, rings = client.status(), client.setup(), client.rings()
+        if status.state is State.FAULTED:
+            raise refusal("no lines are arriving while the daemon is faulted", status.state, status.fault)
         if not rings.arms:
             raise StateError(
                 f"the daemon is {status.state}, so that no lines are arriving",

@@ -22,11 +22,11 @@ from acquire.daemon.news import NewsLog
 from acquire.daemon.plan import default_path, recording_of
 from acquire.daemon.report import Rates, arm_statuses, seconds_since, trigger_status
 from acquire.daemon.salvage import Salvage
-from acquire.daemon.states import Event, Situation, State, after, commands, possible
+from acquire.daemon.states import Event, Situation, State, commands
 from acquire.daemon.take import Take, and_then, in_words, log_event, with_cause
 from acquire.daemon.troubles import Troubles
 from acquire.daemon.uploads import Uploads
-from acquire.errors import AcquireError, StateError, UsageError
+from acquire.errors import AcquireError, UsageError
 from acquire.logs import EACH
 from acquire.store import RunCondition
 from acquire.stream import Begin, CaptureStatus, Note
@@ -185,7 +185,7 @@ class Service:
         """Measure again what the host sustains; only while idle, since a run would disturb it."""
         state = self._now.state
         if state is not State.IDLE:
-            raise StateError(f"measuring is impossible while {state}", possible=possible(state))
+            raise self._now.refusal(f"measuring is impossible while {state}")
         if self._prove is None:
             raise UsageError("this rig's capacity cannot be measured", hint="acquire bench --config RIG")
         self._now.busy = "capacity"
@@ -434,7 +434,7 @@ class Service:
     @contextlib.contextmanager
     def _doing(self, command: Event) -> Iterator[None]:
         """Refuse a command that the state does not allow, or mark it busy. Raises a fault that it ends in."""
-        after(self._now.state, command)
+        self._now.check(command)
         self._now.busy = command
         self._publish()
         try:

@@ -85,10 +85,20 @@ TABLE: dict[tuple[State, Event], State] = {
 
 def after(state: State, event: Event) -> State:
     """Return the state that ``event`` leads to. Raises StateError if the table has no row for it."""
-    try:
-        return TABLE[state, event]
-    except KeyError:
-        raise StateError(f"cannot {event} while {state}", possible=possible(state)) from None
+    if (state, event) not in TABLE:
+        raise refusal(f"cannot {event} while {state}", state)
+    return TABLE[state, event]
+
+
+def refusal(what: str, state: State, fault: str | None = None) -> StateError:
+    """Return the error for something that ``state`` does not allow; it names the fault, if that is why."""
+    if state is not State.FAULTED:
+        return StateError(what, possible=possible(state))
+    return StateError(
+        f"{what}: {fault or 'the fault is not known'}",
+        possible=possible(state),
+        hint="acquire disarm clears the fault, and acquire devices shows any problem with a device",
+    )
 
 
 def commands(state: State) -> tuple[Event, ...]:
@@ -110,6 +120,15 @@ class Situation:
     since_s: float = field(default_factory=time.monotonic)
     busy: str | None = None
     fault: str | None = None
+
+    def check(self, event: Event) -> None:
+        """Raise StateError, with the fault if there is one, if the table has no row for ``event``."""
+        if (self.state, event) not in TABLE:
+            raise self.refusal(f"cannot {event} while {self.state}")
+
+    def refusal(self, what: str) -> StateError:
+        """Return the error for something that the state does not allow."""
+        return refusal(what, self.state, self.fault)
 
     def go(self, event: Event) -> None:
         """Change to the state that ``event`` leads to. Raises StateError if the table has no row for it."""

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 from fake_run import FakeRun, rig_config
@@ -238,6 +240,27 @@ def test_a_recording_that_the_disk_ended_is_a_fault(bed: Bed) -> None:
     assert (status.last.lines, status.last.condition) == (200, "ABORTED")  # as many as the file holds
     bed.service.disarm()
     assert (bed.state, bed.service.status().fault) == (State.IDLE, None)
+
+
+@pytest.mark.parametrize(
+    "command",
+    [
+        lambda service: service.start(StartRequest()),
+        lambda service: service.arm(),
+        lambda service: service.mark("here"),
+        lambda service: service.stop(),
+        lambda service: service.measure(),
+    ],
+    ids=["start", "arm", "mark", "stop", "measure"],
+)
+def test_what_a_fault_forbids_is_refused_with_the_fault(bed: Bed, command: Callable[[Any], None]) -> None:
+    """It said only "cannot start while faulted"."""
+    bed.record()
+    bed.run.see(fault="camera a is gone")
+    bed.service.supervise()
+    with pytest.raises(StateError, match="while faulted: camera a is gone") as refused:
+        command(bed.service)
+    assert (refused.value.possible, refused.value.hint.startswith("acquire disarm ")) == ("disarm", True)
 
 
 def test_failing_end_after_sealing_is_a_fault(tmp_path: Path) -> None:

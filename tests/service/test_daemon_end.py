@@ -138,6 +138,14 @@ def test_a_camera_that_hangs_is_a_fault(start: Start) -> None:
         status = client.wait({State.FAULTED}, 60)
         assert str(status.fault).startswith("arm b: no line for 3 s")
         until_gone(workers)
+        for refused in (
+            daemon("start"),
+            daemon("camera", "live"),
+            daemon("calibrate", "all", "--out", daemon.home / "new.zarr", "--yes"),
+        ):
+            assert refused.code == 4
+            assert "faulted: arm b: no line for 3 s" in refused.err
+            assert "try: acquire disarm clears the fault" in refused.err
         client.disarm()
         client.arm()
         client.disarm()
