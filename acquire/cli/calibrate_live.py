@@ -66,7 +66,7 @@ def instrument(socket: Path | None, directory: Path, out: str) -> Iterator[Clien
         finally:
             # The same run: the command ended before it armed anything, and there is nothing to restore.
             if _settled(daemon, calm_s).run_id != status.run_id:
-                _leave(daemon, directory, armed=status.state == "armed")
+                _leave(daemon, directory, armed=status.state is State.ARMED)
 
 
 def record(

@@ -67,7 +67,7 @@ def serve(
     leave_signals_to_the_server()
     overrides = parse_settings(settings or [])
     if socket is not None:
-        overrides["control.socket"] = str(socket.absolute())
+        overrides.give("control.socket", str(socket.absolute()), "--socket")
     # Found once: a reload reads the same file, whatever the working directory is then.
     path = find(config, kind="rig").absolute()
 

@@ -53,7 +53,8 @@ def device_of(
     overrides = parse_settings(settings or [])
     if url is not None:
         # A port on the command line means a board, whatever trigger the rig has.
-        overrides |= {"trigger.driver": "serial", "trigger.url": url}
+        overrides.give("trigger.driver", "serial", "--url")
+        overrides.give("trigger.url", url, "--url")
     rig = load_rig(config, overrides)
     driver = open_trigger(rig)
     if not isinstance(driver, TriggerDriver):

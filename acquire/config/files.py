@@ -31,6 +31,8 @@ MOST_FILE_BYTES = 2**20
 """Largest configuration file; files written by hand have some kilobytes."""
 
 _MODEL = "a file as `acquire config show rig-demo` prints it"
+_EXAMPLES = {"scene": "scene-leds.toml", "plan": "plan-window.toml"}
+"""Kind of file → a built-in one that is short; a whole rig file is printed by a command."""
 
 M = TypeVar("M", bound=BaseModel)
 
@@ -69,6 +71,18 @@ def find(name: str | Path, beside: Path | None = None, kind: str = "") -> Path:
         f"{what} {shown(str(name))} {_why_no_file(name)}{near}",
         possible=f"a path, or one of the built-in {have}",
     )
+
+
+class Overrides(dict[str, Any]):
+    """Overrides of `load_rig`, and the option of the command line that gives each, for errors."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.options: dict[str, str] = {}
+
+    def give(self, key: str, value: object, option: str) -> None:
+        """Add an override."""
+        self[key], self.options[key] = value, option
 
 
 def find_again(path: Path) -> None:
@@ -126,9 +140,13 @@ def load_rig(
             # A setting may belong to a table that the file leaves out.
             inner = inner.setdefault(key, {})
             if not isinstance(inner, dict):
-                raise ConfigError(f"setting {dotted!r} cannot be set: {key!r} is a value and not a table")
+                raise ConfigError(
+                    f"setting {shown(dotted)} cannot be set: {shown(key)} is a value and not a table",
+                    possible=_SETTINGS,
+                )
         inner[last] = value
-    rig = _validate(RigConfig, table, path)
+    options = {key: getattr(given, "options", {}).get(key, "override") for key in given}
+    rig = _validate(RigConfig, table, path, options=options)
     if (named := rig.calibration) is not None:
         # Relative to the working directory, as on a command line, or else to the file.
         calibration = named if os.path.lexists(named) else path.parent / named
@@ -166,16 +184,17 @@ _SETTINGS = "KEY=VALUE with a TOML value: code.seed=7, name='lab', cameras.a.ser
 _QUOTABLE = re.compile(r"[^'\x00-\x1f]{1,200}")
 
 
-def parse_settings(settings: Sequence[str]) -> dict[str, Any]:
+def parse_settings(settings: Sequence[str]) -> Overrides:
     """Return settings such as ``["code.seed=7", "name='x'"]`` as overrides of `load_rig`; values are TOML."""
-    overrides = {}
+    overrides = Overrides()
     for setting in settings:
         key, equals, value = setting.partition("=")
-        if not equals:
-            raise ConfigError(f"setting {shown(setting)} has no '='", possible=_SETTINGS)
+        if not (equals and all(part.strip() for part in key.split("."))):
+            lacking = "key" if equals else "'='"
+            raise ConfigError(f"setting {shown(setting)} has no {lacking}", possible=_SETTINGS)
         try:
             # RecursionError: tomllib has no limit of its own for brackets in brackets.
-            overrides[key.strip()] = tomllib.loads(f"value = {value}")["value"]
+            overrides.give(key.strip(), tomllib.loads(f"value = {value}")["value"], "--set")
         except (ValueError, RecursionError) as error:
             # Only what can be pasted into a shell as it is.
             quoted = f"""put text in quotes: "{key}='{value}'" """.rstrip()
@@ -251,7 +270,14 @@ def _read(path: Path) -> dict[str, Any]:
 
 
 def _check_kind(table: dict[str, Any], wanted: str, path: Path) -> None:
-    """Raise ConfigError for a file that clearly describes something other than ``wanted``."""
+    """Raise ConfigError for an empty file, or one that clearly describes something other than ``wanted``."""
+    if not table:
+        example = _EXAMPLES.get(wanted)
+        raise ConfigError(
+            f"{path} has no keys: it is empty, or holds nothing but comments",
+            possible=f"a {wanted} file",
+            hint=_MODEL if example is None else f"a copy of {builtin_directory() / example}",
+        )
     # In unclear cases the file is validated, and pydantic reports what is wrong with it.
     found = [kind for kind, keys in _MARKS.items() if keys & table.keys()]
     if len(found) == 1 and found != [wanted]:
@@ -263,9 +289,13 @@ def _check_kind(table: dict[str, Any], wanted: str, path: Path) -> None:
 
 
 def _validate(
-    model: type[M], table: dict[str, Any], path: Path | str, context: Mapping[str, Any] | None = None
+    model: type[M],
+    table: dict[str, Any],
+    path: Path | str,
+    context: Mapping[str, Any] | None = None,
+    options: Mapping[str, str] | None = None,
 ) -> M:
     try:
         return model.model_validate(table, context=context)
     except ValidationError as error:
-        raise ConfigError(explained(error, model, path)) from error
+        raise ConfigError(explained(error, model, path, options)) from error

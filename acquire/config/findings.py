@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import difflib
 from typing import TYPE_CHECKING, Any
 
 from acquire.config.variants import GROUP_KEY
 from acquire.plugins import GROUPS
-from acquire.text import counted, own_words, shortened, shown
+from acquire.text import counted, did_you_mean, own_words, shortened, shown
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator, Mapping
     from pathlib import Path
 
     from pydantic import BaseModel, ValidationError
@@ -19,8 +21,17 @@ MOST_LISTED = 20
 """Largest number of findings that one error lists."""
 
 
-def explained(error: ValidationError, model: type[BaseModel], path: Path | str) -> str:
-    """Return one line per finding, with its key, its value, the reason and what is allowed."""
+def explained(
+    error: ValidationError,
+    model: type[BaseModel],
+    path: Path | str,
+    options: Mapping[str, str] | None = None,
+) -> str:
+    """Return one line per finding, with its key, its value, the reason and what is allowed.
+
+    ``options`` holds the dotted keys that are not from the file → what gives them, such as ``--set``.
+    """
+    options = options or {}
     found: list[Any] = list(error.errors())
     places = [item["loc"] for item in found]
     # Without lists that are too short only because pydantic did not count their invalid items.
@@ -32,14 +43,16 @@ def explained(error: ValidationError, model: type[BaseModel], path: Path | str) 
             len(place) > len(item["loc"]) and place[: len(item["loc"])] == item["loc"] for place in places
         )
     ]
-    lines = [f"{path}: {counted(len(findings), 'error')}"]
+    others = " and ".join(dict.fromkeys(options.values()))
+    lines = [f"{path}{f' with {others}' if others else ''}: {counted(len(findings), 'error')}"]
     for item in findings[:MOST_LISTED]:
         keys, allowed, secret = _locate(model, item["loc"])
-        key = shortened(".".join(keys)) or "(file)"
+        key = _given_by(keys, options) + (shortened(".".join(keys)) or "(file)")
         why = _why(item)
         # pydantic's own sentence, "Extra inputs are not permitted", does not name the keys that are.
         if item["type"] == "extra_forbidden":
-            lines.append(f"  {key}: unknown key; allowed here: {', '.join(allowed) or 'none'}")
+            meant, possible = _meant(keys[-1], allowed, model), ", ".join(allowed) or "none"
+            lines.append(f"  {key}: unknown key{meant}; allowed here: {possible}")
         elif item["type"] == "missing":
             lines.append(f"  {key}: missing")
         # A whole table would be longer than the reason, and a secret would be in the daemon's log.
@@ -54,6 +67,38 @@ def explained(error: ValidationError, model: type[BaseModel], path: Path | str) 
     return "\n".join(lines)
 
 
+def _given_by(keys: list[str], options: Mapping[str, str]) -> str:
+    """Return what gives the key, or a key below it, if that is not the file."""
+    for dotted, option in options.items():
+        given = dotted.split(".")
+        common = min(len(given), len(keys))
+        if common and given[:common] == keys[:common]:
+            return f"{option} "
+    return ""
+
+
+def _meant(key: str, allowed: list[str], model: type[BaseModel]) -> str:
+    """Return a guess at the key that was meant: one next to it, or the dotted key in another table."""
+    schema = model.model_json_schema()
+    elsewhere = dict(reversed([(name.rpartition(".")[2], name) for name in _dotted(schema, schema, 4)]))
+    if key in elsewhere:
+        return f"; did you mean {elsewhere[key]!r}?"
+    if near := did_you_mean(key, allowed):
+        return near
+    close = difflib.get_close_matches(key, elsewhere, n=1, cutoff=0.8)
+    return f"; did you mean {elsewhere[close[0]]!r}?" if close else ""
+
+
+def _dotted(schema: dict[str, Any], node: dict[str, Any], depth: int) -> Iterator[str]:
+    """Yield the dotted keys of a schema, as deep as files are."""
+    if "$ref" in node:
+        node = schema["$defs"][node["$ref"].rsplit("/", 1)[1]]
+    for key, below in node.get("properties", {}).items():
+        yield key
+        if depth:
+            yield from (f"{key}.{name}" for name in _dotted(schema, below, depth - 1))
+
+
 def _why(item: Any) -> str:
     """Return the reason of a finding; pydantic's own for a wrong container names a class that no file has."""
     kind, value = item["type"], item["input"]
@@ -63,6 +108,8 @@ def _why(item: Any) -> str:
         return (
             f"the plug-in asks for a {_CONTAINERS[kind]}, which no file can hold; its field should be a tuple"
         )
+    if kind in ("model_type", "model_attributes_type"):
+        return "a table is expected"
     if kind == "is_instance_of":
         wanted = str(item["ctx"]["class"])
         instead = "acquire.config.base.FilePath" if wanted == "Path" else "of a type that TOML has"

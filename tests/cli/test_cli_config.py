@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import tomllib
 from collections.abc import Callable
 from pathlib import Path
@@ -9,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from acquire.config import RigConfig, builtin_directory, load_rig
+from acquire.config import RigConfig, builtin_directory, load_plan, load_rig, load_scene
 from acquire.errors import ConfigError
 
 Cli = Callable[..., Any]
@@ -222,3 +223,52 @@ def test_a_directory_is_not_a_file(cli: Cli, tmp_path: Path) -> None:
 def test_setting_below_a_value_is_refused(rig_file: Path) -> None:
     with pytest.raises(ConfigError, match="'name' is a value"):
         load_rig(rig_file, {"name.first": 1})
+
+
+@pytest.mark.parametrize(
+    ("setting", "told"),
+    [
+        ("geometry.stagess=4", "--set geometry.stagess: unknown key; did you mean 'stages'?"),
+        ("stages=4", "--set stages: unknown key; did you mean 'geometry.stages'?"),
+        ("trigger.stages=4", "--set trigger.stages: unknown key; did you mean 'geometry.stages'?"),
+        ("geometri.stages=4", "--set geometri: unknown key; did you mean 'geometry'?"),
+        ("geometry.stages=0", "--set geometry.stages = 0: "),
+        ("geometry=4", "--set geometry = 4: a table is expected"),
+        ("=4", "setting '=4' has no key"),
+        ("geometry.=4", "setting 'geometry.=4' has no key"),
+    ],
+)
+def test_a_mistake_in_a_setting_is_not_told_as_one_of_the_file(
+    cli: Cli, rig_file: Path, tmp_path: Path, setting: str, told: str
+) -> None:
+    """The error named the file alone, and no key that was meant."""
+    out = tmp_path / "x.zarr"
+    answer = cli("simulate", "scene-leds", "--config", rig_file, "--out", out, "--set", setting)
+    assert (answer.code, told in answer.err, out.exists()) == (2, True, False), answer.err
+    assert f"{rig_file}: 1 error" not in answer.err
+
+
+def test_an_override_of_a_script_is_named_as_one(rig_file: Path) -> None:
+    with pytest.raises(ConfigError, match=r"with override: 1 error\n  override geometry\.stagess: unknown"):
+        load_rig(rig_file, {"geometry.stagess": 4})
+
+
+@pytest.mark.parametrize("content", ["", "# only a comment\n\n"], ids=["empty", "comments"])
+@pytest.mark.parametrize(
+    ("load", "model"),
+    [
+        (load_rig, "acquire config show rig-demo"),
+        (load_scene, "a copy of .*/scene-leds.toml"),
+        (load_plan, "a copy of .*/plan-window.toml"),
+    ],
+    ids=["rig", "scene", "plan"],
+)
+def test_a_file_without_keys_is_refused_with_a_model(
+    tmp_path: Path, content: str, load: Callable[[Path], object], model: str
+) -> None:
+    """The keys that are missing were listed, and where to find a file that has them was not."""
+    file = tmp_path / "new.toml"
+    file.write_text(content)
+    with pytest.raises(ConfigError, match="has no keys: it is empty, or holds nothing but") as refused:
+        load(file)
+    assert re.search(model, refused.value.hint)

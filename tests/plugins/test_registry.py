@@ -81,7 +81,8 @@ def test_mistakes_in_its_table_are_named_as_those_in_ours(install: Install, tmp_
     with pytest.raises(ConfigError) as caught:
         load_scene(scene(tmp_path, 'kind = "glow"\nlevel = "high"', 'kind = "glow"\nlevl = 3'))
     assert "effects.0.level = 'high': " in str(caught.value)
-    assert "effects.1.levl: unknown key; allowed here: kind, level" in str(caught.value)
+    told = "effects.1.levl: unknown key; did you mean 'level'?; allowed here: kind, level"
+    assert told in str(caught.value)
 
 
 def test_an_unknown_effect_is_refused_with_those_there_are_and_their_origin(
