@@ -6,15 +6,20 @@ in our modules, as a defect of ours.
 
 from __future__ import annotations
 
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from acquire.errors import AcquireError, DeviceError, UsageError
-from acquire.text import shortened, shown
+from acquire.text import shortened, shown, system_words
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
+    from collections.abc import Callable, Iterator, Mapping
+
+
+AUTHOR = "its author, or another version of the distribution"
+"""Who can mend a plug-in that makes a mistake."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,7 +54,6 @@ def checked_call(
 
     Raises UsageError if that is not as expected, and ``failure`` for any error that is not one of ours.
     """
-    author = "its author, or another version of the distribution"
     try:
         found = work()
     except AcquireError:
@@ -57,11 +61,11 @@ def checked_call(
     except Exception as error:
         why = shortened(f"{type(error).__name__}: {error}".removesuffix(": "), 400)
         raise failure(
-            f"{whose} failed in {name}: {why}", hint=f"its cable and options; else {author}"
+            f"{whose} failed in {name}: {why}", hint=f"its cable and options; else {AUTHOR}"
         ) from error
     if expected is not None and not expected.fits(found):
         raise UsageError(
-            f"{whose} gave back {shown(found)} from {name}", possible=expected.words, hint=author
+            f"{whose} gave back {shown(found)} from {name}", possible=expected.words, hint=AUTHOR
         )
     return found
 
@@ -81,3 +85,16 @@ class Guarded:
     def _call(self, name: str, method: Callable[..., Any], *args: Any, **options: Any) -> Any:
         work = partial(method, *args, **options)
         return checked_call(self._whose, name, work, self._expected.get(name), self._failure)
+
+
+@contextmanager
+def files_read(whose: str, doing: str) -> Iterator[None]:
+    """Raise UsageError, which names the plug-in, for a file that it cannot read while it is set up."""
+    try:
+        yield
+    except OSError as error:
+        raise UsageError(
+            f"{whose} cannot be {doing}: {system_words(error)}",
+            possible="files that exist and may be read",
+            hint="the paths among its keys; PLUGINS.md states what they are relative to",
+        ) from error

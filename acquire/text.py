@@ -77,6 +77,13 @@ def cause_in_words(error: BaseException) -> str:
     return str(error) or type(error).__name__
 
 
+def system_words(error: OSError) -> str:
+    """Return what the operating system says of a file, with the whole name of the file."""
+    if error.filename is None or not error.strerror:
+        return shortened(str(error) or type(error).__name__, 400)
+    return f"{shortened(os.fsdecode(error.filename), 400)}: {error.strerror}"
+
+
 def own_words(message: str) -> str:
     """Return pydantic's message about a value without the prefix that it puts before a validator's words."""
     return _PREFIX.sub("", message, count=1)

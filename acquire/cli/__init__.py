@@ -95,7 +95,11 @@ def _refused_by_the_system(error: OSError) -> int:
         return 1
     where = error.filename or ("standard output" if full else "")
     kind = DeviceError if error.errno in HOST_ERRORS else UsageError
-    return _failed(kind(f"{where}: {error.strerror or error}".removeprefix(": ")))
+    text = f"{where}: {error.strerror or error}".removeprefix(": ")
+    from acquire.plugins import raised_by
+
+    module = raised_by(error)
+    return _failed(kind(f"{module}: {text}" if module else text))
 
 
 def _is_full(stream: TextIO) -> bool:

@@ -9,7 +9,7 @@
     voxels: ground truth, for comparison
 
     scenes    leds, digits, shutters, sprites, targets (the paper's); media (files), functions, procedural;
-              drawn with shapes and kernels, or on a canvas
+              drawn with shapes and kernels, or on a canvas; those of plug-ins: checked
     cameras   optics ▸ lines ▸ readout, compact (both arms on one sensor), stopwatch; pattern: without a scene
     trigger   trigger_model with trigger_registers, trigger_run, trigger_code, arming (what it refuses); or
               rtl: the gateware, and pins: what its cameras see; twin_links: a port to either

@@ -12,6 +12,7 @@ import numpy as np
 from pydantic import Field
 
 from acquire.errors import UsageError
+from acquire.sim.light import first_unfit
 from acquire.sim.scene import SceneModel
 
 if TYPE_CHECKING:
@@ -66,29 +67,38 @@ class FunctionScene:
             light = self._function((substeps + 0.5) * self._substep_s, self._row, self._column)
         except Exception as error:  # the user's own code may raise anything
             raise _raised(name, error) from error
-        frames = checked_light(light, (len(substeps), self.size, self.size), name)
+        shape = (len(substeps), self.size, self.size)
+        frames = checked_light(light, shape, name, substeps=substeps)
         # A shutter covers frames in place, and the function may have returned an array that it keeps.
         return frames.copy()
 
 
-def checked_light(light: Any, shape: tuple[int, ...], what: str) -> NDArray[np.float32]:
-    """Return light as float32 of ``shape``. Raises UsageError for anything else."""
+def checked_light(
+    light: Any,
+    shape: tuple[int, ...],
+    what: str,
+    *,
+    first: int = 0,
+    substeps: NDArray[np.int64] | None = None,
+) -> NDArray[np.float32]:
+    """Return light as float32 of ``shape``. Raises UsageError for anything else.
+
+    Its frames are those from number ``first`` on, or those of ``substeps``.
+    """
     try:
         frames = np.asarray(light, dtype=np.float32)
     except (TypeError, ValueError) as error:
         raise UsageError(f"the light of {what} is not an array of numbers: {error}") from error
     if frames.shape != shape:
         raise UsageError(f"the light of {what} has shape {frames.shape}", possible=f"{shape}")
-    if not np.isfinite(frames).all():
-        nan, infinite = int(np.isnan(frames).sum()), int(np.isinf(frames).sum())
+    if (found := first_unfit(frames)) is not None:
+        *frame, row, column = found
+        where = ""
+        for index in frame:  # a single picture has none
+            where = f"frame {first + index}, " if substeps is None else f"sub-step {substeps[index]}, "
         raise UsageError(
-            f"the light of {what} is not finite: {nan} pixels are NaN, {infinite} infinite",
+            f"the light of {what} is {frames[found]:g} at {where}pixel ({row}, {column})",
             possible="finite numbers, 0 or more",
-        )
-    if frames.size and frames.min() < 0:
-        raise UsageError(
-            f"the light of {what} must not be negative, but is as low as {frames.min():g}",
-            possible="0 or more",
         )
     return frames
 

@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from acquire.codes import Code
     from acquire.sim.scene import Scene
 
+_LARGEST = np.float32(np.finfo(np.float32).max).view(np.uint32)
 Series = Callable[[int, int], "NDArray[Any]"]
 """(first sub-step, count) → values, time on the last axis."""
 
@@ -82,3 +83,14 @@ class Tiled:
         skip = first % self._length
         values: NDArray[Any] = np.concatenate(tiles, axis=-1)[..., skip : skip + count]
         return values
+
+
+def first_unfit(light: NDArray[Any]) -> tuple[int, ...] | None:
+    """Return the index of the first value that is negative, infinite or not a number; None if none is."""
+    # One pass over the bits of float32: a sign, an infinity and a NaN are all above the largest number. So is
+    # -0.0, which is then found to be fit. A comparison and a test for finite numbers take six times as long.
+    by_bits = light.dtype == np.float32 and light.flags.c_contiguous
+    if not light.size or (by_bits and light.view(np.uint32).max() <= _LARGEST):
+        return None
+    unfit = np.flatnonzero(~((light >= 0) & np.isfinite(light)))
+    return tuple(int(i) for i in np.unravel_index(unfit[0], light.shape)) if len(unfit) else None

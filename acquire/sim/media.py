@@ -248,7 +248,7 @@ class _ArrayFile:
         step = max(1, _CHECKED_VALUES // (shape[1] * shape[2]))
         for first in range(0, shape[0], step):
             part = self._read(first, min(first + step, shape[0]))
-            checked_light(part, part.shape, f"{path}, frames {first} to {first + len(part) - 1},")
+            checked_light(part, part.shape, str(path), first=first)
 
     @property
     def count(self) -> int:

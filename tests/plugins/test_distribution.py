@@ -134,7 +134,20 @@ def test_a_misspelt_group_is_named(acquire: Run) -> None:
             "oblong",
             "",
             2,
-            "scene 'oblong' gave back shape (1, 16, 15) for one frame\n  possible: (1, 16, 16)",
+            "scene 'oblong' of lab-broken 0.1 gave back shape (1, 16, 15) for one frame\n"
+            "  possible: (1, 16, 16)",
+        ),
+        (
+            'gloom"\nfile = "/nowhere/sky.npy',
+            "",
+            2,
+            "scene 'gloom' of lab-broken 0.1 cannot be built: /nowhere/sky.npy: No such file or directory",
+        ),
+        (
+            "stars",
+            "lost",
+            2,
+            "effect 'lost' of lab-broken 0.1 cannot be set up: /nowhere/gain.npy: No such file or directory",
         ),
         ("stars", "short", 2, "effect short gave back shape (255, 8) for lines of shape (256, 8)"),
         ("stars", "hollow", 1, "effect hollow gave back values that are not numbers (NaN)"),
@@ -149,6 +162,25 @@ def test_mistakes_in_use_are_named_with_the_plug_in(
     made = acquire("simulate", "scene.toml", "--config", "rig.toml", "--lines", "300", "--out", "x.zarr")
     assert made.returncode == code
     assert told in made.stderr
+
+
+@pytest.mark.parametrize("light", ["-1.5", "-1e-30", "nan", "inf", "-inf"])
+@pytest.mark.parametrize("masks", ["false", "true"], ids=["frames", "masks"])
+def test_light_that_cannot_be_is_refused_with_its_place(
+    acquire: Run, tmp_path: Path, light: str, masks: str
+) -> None:
+    """Negative light was recorded as darker lines, without a word."""
+    (tmp_path / "scene.toml").write_text(f'kind = "gloom"\nlight = "{light}"\nmasks = {masks}\n')
+    made = acquire("simulate", "scene.toml", "--config", "rig.toml", "--lines", "600", "--out", "x.zarr")
+    assert made.returncode == 2, made.stderr
+    told = re.search(
+        r"scene 'gloom' of lab-broken 0\.1 gave back light of (\S+) at sub-step (\d+), (.*)", made.stderr
+    )
+    assert told is not None, made.stderr
+    assert float(told[1]) == pytest.approx(float(light), nan_ok=True)
+    assert 700 <= int(told[2]) < 710  # the first that is lit
+    assert told[3].endswith("pixel (3, 5)")
+    assert "possible: finite numbers, 0 or more\n  try: its author" in made.stderr
 
 
 def test_a_trigger_derived_from_the_simulated_one_supports_what_that_supports(

@@ -20,6 +20,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
+from acquire.guarded import files_read
 from acquire.plugins import EFFECTS
 from acquire.sim.effects.base import PLACES, Effect, Setting, Stage
 
@@ -46,7 +47,10 @@ def build_stages(effects: Iterable[Any], setting: Setting) -> list[Stage]:
     # Not imported by scenes without effects.
     from acquire.sim.effects.checked import checked_stages
 
-    stages = [s for effect in in_order(effects) for s in checked_stages(effect.kind, effect.stages(setting))]
+    stages = []
+    for effect in in_order(effects):
+        with files_read(EFFECTS.whose(effect.kind) or f"effect {effect.kind!r}", "set up"):
+            stages += checked_stages(effect.kind, effect.stages(setting))
     # An effect may act in several places. Sorting is stable: within a place the order of the effects remains.
     return sorted(stages, key=lambda stage: PLACES.index(stage.place))
 
