@@ -20,6 +20,7 @@ if TYPE_CHECKING:
 _ALLOWED = " \u00a0\u202f"
 """Spaces that typography needs; every other separator and control character is escaped."""
 _SUSPECT = re.compile(r"[^ -~]")
+_NOUN = re.compile(r"^(Input|String|List|Tuple|Value|Dictionary) should ")
 _PREFIX = re.compile(r"(^|(?<=: ))Value error, ")
 
 
@@ -43,6 +44,14 @@ def shortened(text: object, characters: int = 120) -> str:
     """Return ``text``, visible and cut to ``characters``, with an ellipsis at the cut."""
     shown = visible(text)
     return shown if len(shown) <= characters else f"{shown[: characters - 1]}…"
+
+
+def unexpanded(path: object) -> str:
+    """Return what to try for a path with a ~ that the shell has left as it is; else an empty text."""
+    # As in --out=~/x.zarr and in quotes. A directory of that name is one that nobody wants.
+    if not any(part.startswith("~") for part in str(path).split("/")):
+        return ""
+    return "$HOME in place of ~, which the shell replaces only at the beginning of a word without quotes"
 
 
 _OF_SEVERAL = {"was": "were", "is": "are", "has": "have", "does": "do", "follows": "follow", "finds": "find"}
@@ -85,8 +94,8 @@ def system_words(error: OSError) -> str:
 
 
 def own_words(message: str) -> str:
-    """Return pydantic's message about a value without the prefix that it puts before a validator's words."""
-    return _PREFIX.sub("", message, count=1)
+    """Return pydantic's message about a value in words that follow the value, without any prefix."""
+    return _NOUN.sub("must ", _PREFIX.sub("", message, count=1), count=1)
 
 
 # Not `repr`, which would first write out all of a large value.

@@ -147,17 +147,17 @@ def test_of_simulations(tmp_path: Path) -> None:
 
 
 OF_CLIENTS: dict[str, tuple[Callable[[Any], Any], str]] = {
-    "lines": (lambda c: c.start(lines=-5), r"start: lines = -5: Input should be greater"),
+    "lines": (lambda c: c.start(lines=-5), r"start: lines = -5: must be greater"),
     "seconds": (
         lambda c: c.start(duration_s="x"),
-        r"start: duration_s = 'x': Input should be a valid number",
+        r"start: duration_s = 'x': must be a valid number",
     ),
     "two": (lambda c: c.start(lines=5, duration_s=1.0), r"^start: lines and duration_s exclude each other"),
     "path": (lambda c: c.start(5), r"start: path = 5: Input is not a valid path"),
     "name": (lambda c: c.start("a\udcff.zarr"), r"^start: path '.*a\\udcff\.zarr' is not UTF-8"),
-    "code": (lambda c: c.arm(code="blue"), r"arm: code = 'blue': Input should be 'rig', 'dark' or 'steady'"),
+    "code": (lambda c: c.arm(code="blue"), r"arm: code = 'blue': must be 'rig', 'dark' or 'steady'"),
     "delays": (lambda c: c.arm(delays={"a": 1}), r"^arm: delays\.light_lead: Field required"),
-    "text": (lambda c: c.mark(5), r"mark: text = 5: Input should be a valid string"),
+    "text": (lambda c: c.mark(5), r"mark: text = 5: must be a valid string"),
     "id": (
         lambda c: c.mark("", request_id="a b"),
         r"mark: request_id = 'a b' is not a request id; possible: 1 to",

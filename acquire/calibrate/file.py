@@ -26,12 +26,12 @@ from acquire.store.camera_stream import child_array
 from acquire.store.delivery import check_new_file, check_new_place, delivery_to
 from acquire.store.files import DISK, check_new_path
 from acquire.store.layout import DAMAGE, group_document, to_json
-from acquire.store.opening import read_root
+from acquire.store.opening import format_in_words, is_file, read_root
 from acquire.store.refusals import refused
 from acquire.store.remote import is_url
 from acquire.store.source import LocalSource, source_of
 from acquire.store.swap import BEFORE, alone, beside, clear_left_over, left_over, put_back, swap_in
-from acquire.text import visible
+from acquire.text import unexpanded, visible
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -161,14 +161,17 @@ def _opened(source: Source) -> Calibration:
     with refused(source, "read"):
         there = source.exists()
     if not there:
-        raise PlaceError(f"{source} does not exist", hint=HINT)
+        raise PlaceError(f"{source} does not exist", hint=unexpanded(source) or HINT)
     try:
         attributes = read_root(source)["attributes"]
     except PlaceError as error:
-        raise PlaceError(f"{source} is not a calibration: it holds no zarr.json", hint=HINT) from error
+        if isinstance(error.__cause__, PermissionError):
+            raise
+        why = "it is a file" if is_file(error.__cause__) else "it holds no zarr.json"
+        raise PlaceError(f"{source} is not a calibration: {why}", hint=HINT) from error
     if attributes.get("format") != FORMAT:
         raise PlaceError(
-            f"{source} is not a calibration: format {attributes.get('format')!r}",
+            f"{source} is not a calibration: {format_in_words(attributes.get('format'))}",
             possible=f"{FORMAT!r}",
             hint=HINT,
         )

@@ -93,6 +93,10 @@ def _refused_by_the_system(error: OSError) -> int:
     # As other programs end in `acquire ls | head`.
     if error.errno == errno.EPIPE:
         return 1
+    if error.errno == errno.ENOENT and error.filename is None and not _is_somewhere():
+        return _failed(
+            UsageError("the current directory does not exist any more", hint="cd to a directory that exists")
+        )
     where = error.filename or ("standard output" if full else "")
     kind = DeviceError if error.errno in HOST_ERRORS else UsageError
     text = f"{where}: {error.strerror or error}".removeprefix(": ")
@@ -100,6 +104,15 @@ def _refused_by_the_system(error: OSError) -> int:
 
     module = raised_by(error)
     return _failed(kind(f"{module}: {text}" if module else text))
+
+
+def _is_somewhere() -> bool:
+    """Whether there is a current directory: it may have been removed since the shell entered it."""
+    try:
+        os.getcwd()  # noqa: PTH109
+    except FileNotFoundError:
+        return False
+    return True
 
 
 def _is_full(stream: TextIO) -> bool:

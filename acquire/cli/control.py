@@ -87,11 +87,34 @@ def start(
 
     Example: [bold]acquire start run.zarr --lines 100000[/], or [bold]acquire start --pre 2s --post 1s[/]
     """
+    _check(path, options)
     with _daemon(socket) as daemon:
         status = daemon.start(path, **options)
     show(status, json)
     if status.light in ("dark", "steady"):
         print_warning(without_code(status.light))
+
+
+def _check(path: Path | None, options: StartOptions) -> None:
+    """Raise UsageError for options that exclude each other: the message of the API names no options."""
+    if (lines := options.get("lines")) is not None and lines < 1:
+        raise UsageError(f"--lines {lines} is out of range", possible="1 or more")
+    given = {"--lines": "lines", "--duration": "duration_s", "--post": "post_s"}
+    budgets = [option for option, name in given.items() if name in options]
+    if len(budgets) > 1:
+        raise UsageError(f"{' and '.join(budgets)} exclude each other", possible="one of them")
+    pre, whole = options.get("pre_s", 0.0), options.get("duration_s")
+    if whole is not None and pre >= whole:
+        raise UsageError(
+            f"--pre {pre:g}s cannot be as long as --duration {whole:g}s, which includes it",
+            possible="a longer --duration, or --post, which does not include it",
+        )
+    if options.get("resume") and path is None:
+        raise UsageError(
+            "--resume needs the recording to continue",
+            possible="acquire start --resume NAME.zarr",
+            hint="acquire ls DIR lists those of a directory",
+        )
 
 
 def mark(

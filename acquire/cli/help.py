@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from acquire.cli.coercion import range_in_words
 from acquire.cli.commands import COMMANDS
+from acquire.cli.output import say
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -72,8 +73,24 @@ def make_plain(command: Any) -> None:
         command.short_help = command.help.partition("\n\n")[0].replace("\n", " ")
     for parameter in command.params:
         _name_value(parameter)
+    makes_help = command.get_help_option
+    command.get_help_option = lambda ctx: _saying(makes_help(ctx))
     for below in getattr(command, "commands", {}).values():
         make_plain(below)
+
+
+def _saying(option: Any) -> Any:
+    """Let the option for help print as all commands do, so that an error of standard output names that."""
+
+    def say_help(ctx: Any, _option: Any, wanted: bool) -> None:
+        if wanted and not ctx.resilient_parsing:
+            for line in ctx.get_help().splitlines():
+                say(line)
+            ctx.exit()
+
+    if option is not None:
+        option.callback = say_help
+    return option
 
 
 def _name_value(parameter: Any) -> None:

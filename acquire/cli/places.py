@@ -53,8 +53,9 @@ def calibration_place(text: str) -> str:
     return text
 
 
-def local_directory(text: str) -> Path:
+def local_directory(given: str | Path) -> Path:
     """Parse a directory on this machine. Raises UsageError for an empty path, and a URL of anything else."""
+    text = str(given)  # typer gives the default to the parser as well, and that is a path
     if _is_elsewhere(given_path(text)):
         raise UsageError(
             f"{text} is a URL, but `acquire ls` lists a directory of this machine",

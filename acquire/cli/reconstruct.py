@@ -318,6 +318,9 @@ def _voxels(
     """Return the voxel sizes that were asked for, in either way; none if there was no such option."""
     if spatial_merge is None and temporal_merge is None:
         return tuple(sizes or ())
+    for option, merge in (("--nm", spatial_merge), ("--tm", temporal_merge)):
+        if merge is not None and merge < 1:
+            raise UsageError(f"{option} {merge} is out of range", possible="1 or more")
     if sizes:
         raise UsageError(
             "--voxels and --nm or --tm exclude each other", possible="--voxels NMxTM, or --nm and --tm"

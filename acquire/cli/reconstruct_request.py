@@ -208,7 +208,12 @@ def parse_voxels(text: str) -> Voxels:
 def parse_segment(text: str) -> dict[str, float]:
     """Parse a sub-segment to a table of a plan file: by lines, ``712:3x4``, by time, ``1.1ms:1x230``, or the
     rest, ``:3x4``."""
-    length, _, kind = text.rpartition(":")
+    length, colon, kind = text.rpartition(":")
+    if not colon:
+        raise UsageError(
+            f"the sub-segment {text!r} cannot be read: it has no ':' before its voxel size",
+            possible="LENGTH:NMxTM, such as 712:3x4 (lines), 1.1ms:1x230, or :3x4 for the rest",
+        )
     voxels = parse_voxels(kind)
     table: dict[str, float] = {
         "spatial_merge": voxels.spatial_merge,

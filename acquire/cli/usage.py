@@ -77,8 +77,11 @@ def run(words: Sequence[str]) -> int:
         is_option = first.startswith("-")
         what = f"there is no option {first}" if is_option else f"there is no command {first!r}"
         known = ("--version", *_HELP) if is_option else tuple(BY_NAME)
+        command = words[1] if first == "help" and words[1:2] and words[1] in BY_NAME else ""
         raise UsageError(
-            f"{what}{did_you_mean(first, known)}", possible=", ".join(sorted(known)), hint="acquire --help"
+            f"{what}{did_you_mean(first, known)}",
+            possible=", ".join(sorted(known)),
+            hint=" ".join(filter(None, ("acquire", command, "--help"))),
         )
     # This module alone: a command need not wait for the imports of all others.
     command = command_of([BY_NAME[first].module])
@@ -149,15 +152,26 @@ def _usage_error(error: Any, command: str) -> UsageError:
     sentence = message[:1].lower() + message[1:]
     sentence = re.sub(r"^no such (option|command):? ", r"there is no \1 ", sentence)
     sentence = re.sub(r"^missing ((?:option|argument) .*)", r"the \1 is missing", sentence)
+    sentence = re.sub(r"^got unexpected extra argument\S* \((.*)\)$", r"'\1' is more than it takes", sentence)
     # for a group of commands whose subcommand is missing or unknown
     choices = list(getattr(context.command, "commands", {})) if context is not None else []
     mistaken = message.partition("'")[2].partition("'")[0]  # the word that click quotes
     meant = f"; did you mean {near[0]!r}?" if near else did_you_mean(mistaken, choices)
-    return UsageError(
-        f"{where}{sentence}{meant}",
-        possible=", ".join(sorted(near) if near else choices),
-        hint=f"{command} --help",
-    )
+    possible = ", ".join(sorted(near) if near else choices)
+    usage = _usage(context)
+    if usage and sentence == "there is no option --out":
+        # Other commands have it, and the nearest option, --to, is a time.
+        possible, meant = usage, ": the output is an argument"
+    elif "argument" in message:
+        possible = possible or usage
+    return UsageError(f"{where}{sentence}{meant}", possible=possible, hint=f"{command} --help")
+
+
+def _usage(context: Any) -> str:
+    """Return how a command with arguments is called; an empty text for one without."""
+    if context is None or not any(each.param_type_name == "argument" for each in context.command.params):
+        return ""
+    return " ".join([context.command_path, *context.command.collect_usage_pieces(context)])
 
 
 def _options(

@@ -187,7 +187,7 @@ class Client:
                     f"the daemon is still {status.state} after {timeout_s:g} s of waiting for {wanted}{why}",
                     hint="acquire disarm, or wait for sealed: a recording's end leaves the instrument armed"
                     if staying
-                    else "acquire status, or a longer timeout_s",
+                    else "acquire status, or more time",
                 )
             time.sleep(POLL_S)
         return status

@@ -20,7 +20,7 @@ from acquire.errors import ConfigError
 from acquire.place import builtin_directory, builtin_names
 from acquire.plugins import SCENES
 from acquire.reading import read_regular
-from acquire.text import did_you_mean, shortened, shown
+from acquire.text import did_you_mean, shortened, shown, unexpanded
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -70,6 +70,7 @@ def find(name: str | Path, beside: Path | None = None, kind: str = "") -> Path:
     raise ConfigError(
         f"{what} {shown(str(name))} {_why_no_file(name)}{near}",
         possible=f"a path, or one of the built-in {have}",
+        hint=unexpanded(name),
     )
 
 
@@ -167,7 +168,8 @@ def check_directory(rig: RigConfig) -> None:
         is_directory = stat.S_ISDIR(directory.stat().st_mode)
     except FileNotFoundError as error:
         raise ConfigError(
-            f"recording.directory: there is no directory {directory}", hint="create it first"
+            f"recording.directory: there is no directory {directory}",
+            hint=unexpanded(directory) or "create it first",
         ) from error
     except OSError as error:  # a loop of links, a name that is too long, a directory that may not be entered
         raise ConfigError(

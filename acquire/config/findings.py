@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 from typing import TYPE_CHECKING, Any
 
 from acquire.config.variants import GROUP_KEY
@@ -81,12 +80,8 @@ def _meant(key: str, allowed: list[str], model: type[BaseModel]) -> str:
     """Return a guess at the key that was meant: one next to it, or the dotted key in another table."""
     schema = model.model_json_schema()
     elsewhere = dict(reversed([(name.rpartition(".")[2], name) for name in _dotted(schema, schema, 4)]))
-    if key in elsewhere:
-        return f"; did you mean {elsewhere[key]!r}?"
-    if near := did_you_mean(key, allowed):
-        return near
-    close = difflib.get_close_matches(key, elsewhere, n=1, cutoff=0.8)
-    return f"; did you mean {elsewhere[close[0]]!r}?" if close else ""
+    # Of another table only the very same name: 'seed' is not 'simulation.speed'.
+    return f"; did you mean {elsewhere[key]!r}?" if key in elsewhere else did_you_mean(key, allowed)
 
 
 def _dotted(schema: dict[str, Any], node: dict[str, Any], depth: int) -> Iterator[str]:

@@ -45,6 +45,12 @@ def connect(path: Path, timeout_s: float) -> socket.socket:
         _check_peer(connection, path)
     except OSError as error:
         connection.close()
+        if path.exists() and not path.is_socket():
+            kind = "directory" if path.is_dir() else "file"
+            raise NoDaemonError(
+                f"no daemon listens on {path}, which is a {kind} and not a socket",
+                hint="the path of the daemon's control socket, which `acquire config check RIG` shows",
+            ) from error
         raise NoDaemonError(
             f"no daemon listens on {path} ({error.strerror or error})",
             hint=f"acquire serve --config rig-demo --socket {path}",

@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING
 from acquire.errors import StateError, UsageError
 from acquire.reading import kind_of, open_regular, read_object
 from acquire.store.pages import aligned_bytes, open_direct
+from acquire.text import unexpanded
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
@@ -85,7 +86,7 @@ def no_directory(path: Path) -> tuple[str, str] | None:
         if way.exists() and not way.is_dir():
             kind = "a file" if way.is_file() else "something else"
             return f"{way} is {kind} and not a directory", "a path in a directory"
-    return f"the directory {path} does not exist", "create it first"
+    return f"the directory {path} does not exist", unexpanded(path) or "create it first"
 
 
 def _not_writable(directory: Path) -> tuple[str, str]:

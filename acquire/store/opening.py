@@ -15,7 +15,7 @@ from acquire.store.extent import check_lengths
 from acquire.store.layout import DAMAGE, READABLE
 from acquire.store.refusals import refusal, refused
 from acquire.store.source import source_of
-from acquire.text import cause_in_words
+from acquire.text import cause_in_words, unexpanded
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -53,7 +53,7 @@ def opened(source: Source, kind: type[Kind], document: Document | None = None) -
             )
         of = other_kind(name) or "Zarr group"
         raise PlaceError(
-            f"{source} is a {of}, but not a recording: format {name!r}",
+            f"{source} is a {of}, but not a recording: {format_in_words(name)}",
             possible=", ".join(map(repr, READABLE)),
             hint=_SHOWN_BY.get(of, "the path of a recording"),
         )
@@ -92,7 +92,7 @@ def read_root(source: Source) -> Document:
         document: Document = parse_object(source.read("zarr.json"))
         _check_object(document["attributes"])
     except (FileNotFoundError, NotADirectoryError, IsADirectoryError) as error:
-        raise _no_root(source) from error
+        raise _no_root(source, error) from error
     except OddFileError as error:
         raise DataError(
             f"{source}: zarr.json is damaged: {error.strerror}", hint="a copy of the recording"
@@ -104,19 +104,31 @@ def read_root(source: Source) -> Document:
     return document
 
 
-def _no_root(source: Source) -> AcquireError:
+def _no_root(source: Source, error: OSError) -> AcquireError:
     """Return the error for missing root metadata: nothing there, something else, or a damaged recording."""
     hint = "the path or URL of a directory NAME.zarr; `acquire ls DIR` lists those of a directory"
     with refused(source, "read"):
         if not source.exists():
-            return PlaceError(f"{source} does not exist", hint=hint)
+            return PlaceError(f"{source} does not exist", hint=unexpanded(source) or hint)
         with suppress(FileNotFoundError, NotADirectoryError):
             source.size(f"{ARMS[0]}/lines/zarr.json")
             return DataError(
                 f"{source} is a recording whose root metadata, zarr.json, is missing",
                 hint=f"acquire recover {source}; the lines themselves are still in a/ and b/",
             )
+    if is_file(error):
+        return PlaceError(f"{source} is not a recording: it is a file", hint=hint)
     return PlaceError(f"{source} is not a recording: it holds no zarr.json", hint=hint)
+
+
+def is_file(error: BaseException | None) -> bool:
+    """Return whether a root document could not be read because the place is a file."""
+    return isinstance(error, NotADirectoryError)
+
+
+def format_in_words(name: object) -> str:
+    """Return the format that a root document states, as a clause."""
+    return f"its format is {name!r}" if name is not None else "it states no format"
 
 
 def _check_object(attributes: Any) -> None:

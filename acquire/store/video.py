@@ -29,12 +29,12 @@ from acquire.errors import DataError, PlaceError, UsageError
 from acquire.showing import as_picture, as_table, in_words
 from acquire.store.camera_stream import child_array
 from acquire.store.layout import DAMAGE
-from acquire.store.opening import read_root
-from acquire.store.refusals import refused
+from acquire.store.opening import format_in_words, read_root
+from acquire.store.refusals import refusal, refused
 from acquire.store.source import source_of
 from acquire.store.video_layout import EVERY_CHUNK, FORMAT, VideoGrid
 from acquire.store.video_writer import VideoWriter, check_provenance
-from acquire.text import cause_in_words, shortened
+from acquire.text import cause_in_words, shortened, unexpanded
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
@@ -295,7 +295,7 @@ def open_video(place: Path | str) -> VideoFile:
         with refused(source, "read"):
             there = source.exists()
         if not there:
-            raise PlaceError(f"{source} does not exist", hint=_VIDEO)
+            raise PlaceError(f"{source} does not exist", hint=unexpanded(source) or _VIDEO)
         # Refuses a pipe, for which zarr would wait, and a device, which it would read for ever. PlaceError is
         # raised below, with a text about videos.
         with suppress(PlaceError):
@@ -304,7 +304,7 @@ def open_video(place: Path | str) -> VideoFile:
         attributes = dict(group.attrs)
         if attributes.get("format") != FORMAT:
             raise PlaceError(
-                f"{source} is not a video of acquire: format {attributes.get('format')!r}",
+                f"{source} is not a video of acquire: {format_in_words(attributes.get('format'))}",
                 possible=f"{FORMAT!r}",
                 hint="acquire reconstruct, which makes videos of recordings",
             )
@@ -319,6 +319,8 @@ def open_video(place: Path | str) -> VideoFile:
         _check(found)
     except (GroupNotFoundError, NotADirectoryError) as error:
         raise PlaceError(f"{source} is not a video: it is not a Zarr group", hint=_VIDEO) from error
+    except PermissionError as error:
+        raise refusal(source, error, "read") from error
     except DAMAGE as error:
         raise DataError(
             f"{source} is not a video, or is damaged: {cause_in_words(error)}",

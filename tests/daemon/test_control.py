@@ -338,7 +338,7 @@ def test_json_that_no_parser_takes_is_refused_in_words(path: Path, daemon: Clien
 
 def test_marks_are_bounded_and_text(daemon: Client, run: FakeRun) -> None:
     daemon.arm()
-    with pytest.raises(UsageError, match=r"mark: text = 'xxx.*xxx': String should have at most 400 char"):
+    with pytest.raises(UsageError, match=r"mark: text = 'xxx.*xxx': must have at most 400 char"):
         daemon.mark("x" * 401)
     with pytest.raises(UsageError, match=r"mark: text .*unicode"):
         daemon.mark("caf\udce9")

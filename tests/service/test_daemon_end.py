@@ -148,6 +148,8 @@ def test_a_camera_that_hangs_is_a_fault(start: Start) -> None:
             assert "try: acquire disarm clears the fault" in refused.err
         client.disarm()
         client.arm()
+        late = daemon("status", "--wait", "recording", "--timeout", "0.1")
+        assert (late.code, "timeout_s" in late.err) == (4, False)  # which is no option of the command
         client.disarm()
 
 

@@ -141,7 +141,8 @@ def await_daemon(client: Client, process: subprocess.Popen[bytes], log: Path) ->
             if process.poll() is not None:
                 # The error is at the end; the hint names the whole log.
                 last = log.read_text(errors="replace").strip().splitlines()[-3:]
-                raise AcquireError(f"the daemon ended at once: {' '.join(last)}", hint=str(log)) from None
+                why = " ".join(last) or "its log is empty, as on a disk that is full"
+                raise AcquireError(f"the daemon ended at once: {why}", hint=str(log)) from None
             if time.monotonic() > deadline:
                 raise
             time.sleep(POLL_S)
