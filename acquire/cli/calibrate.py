@@ -15,7 +15,7 @@ from acquire.cli.calibrate_live import refuse_other
 from acquire.cli.calibrate_sheet import sheet
 from acquire.cli.completion import recordings
 from acquire.cli.output import JsonFlag, print_facts, print_json, print_table, print_warning, say
-from acquire.cli.places import calibration_place
+from acquire.cli.places import calibration_place, given_path
 from acquire.cli.progress import stage_progress
 from acquire.cli.stretch import FirstLineOption, FromOption, LinesOption, ToOption, lines_between
 from acquire.errors import PlaceError, UsageError
@@ -289,7 +289,8 @@ def veil(
 
 def show(
     calibration: Annotated[
-        str, typer.Argument(metavar="CAL", help="Calibration, or a recording that holds one.")
+        str,
+        typer.Argument(metavar="CAL", help="Calibration, or a recording that holds one.", parser=given_path),
     ],
     out: Annotated[
         Path | None,
@@ -337,7 +338,9 @@ def show(
 
 
 def check(
-    calibration: Annotated[str, typer.Argument(metavar="CAL", help="Calibration NAME.zarr.")],
+    calibration: Annotated[
+        str, typer.Argument(metavar="CAL", help="Calibration NAME.zarr.", parser=given_path)
+    ],
     recording: RecordingArgument,
     covered: CoveredOption = False,
     first_line: FirstLineOption = None,

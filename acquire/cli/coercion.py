@@ -50,6 +50,9 @@ class Quick:
         # What needs more than a conversion is left to typer: its validator takes long to build, but is right.
         if self._type in (None, bool) or several:
             return self._slow().coerce(value, param=param, ctx=ctx)
+        if self._type is Path and value == "":
+            # As of a shell's variable that is not set. Python takes it for the current directory.
+            raise typer.BadParameter("the path is empty", ctx=ctx, param=param)
         try:
             found = self._type(value)
         except typer.BadParameter:  # of a parser of ours: typer calls it again and adds the option's name

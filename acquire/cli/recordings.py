@@ -217,6 +217,7 @@ def upload(
         typer.Argument(
             metavar="URL",
             help="URL of the copy: s3://bucket/NAME.zarr, or any other URL that fsspec supports.",
+            parser=given_path,
         ),
     ],
     follow: Annotated[

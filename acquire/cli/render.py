@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 
 from acquire.cli.output import JsonFlag, print_json, quantity, say
+from acquire.cli.places import given_path
 from acquire.cli.progress import stage_progress
 from acquire.errors import UsageError
 from acquire.text import counted
@@ -80,7 +81,7 @@ def render(
     check_suffix(out)
     check_new_file(out)
     # A URL has slashes on every system.
-    panels = [Panel(PurePosixPath(place).stem, open_video(place)) for place in video]
+    panels = [Panel(PurePosixPath(place).stem, open_video(given_path(place))) for place in video]
     with (
         stage_progress(f"rendering {out.name}") as advance,
         whole_file(out, keep_suffix=True) as part,

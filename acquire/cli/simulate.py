@@ -83,7 +83,7 @@ def simulate(
     limit_blas(1)  # both arms compute at the same time
     shown = load_scene(scene)
     # With the scene, for a rig file that names none: it was refused although a scene had been given.
-    rig = load_rig(config or shown.rig, parse_settings(settings or []), scene)
+    rig = load_rig(shown.rig if config is None else config, parse_settings(settings or []), scene)
     count = shown.lines if lines is None else lines
     if duration is not None:
         if lines is not None:

@@ -77,7 +77,9 @@ def run(words: Sequence[str]) -> int:
         is_option = first.startswith("-")
         what = f"there is no option {first}" if is_option else f"there is no command {first!r}"
         known = ("--version", *_HELP) if is_option else tuple(BY_NAME)
-        command = words[1] if first == "help" and words[1:2] and words[1] in BY_NAME else ""
+        # `help start`, and `--config RIG serve`: options come after the command.
+        later = next((word for word in words[1:] if word in BY_NAME), "")
+        command = later if first == "help" or is_option else ""
         raise UsageError(
             f"{what}{did_you_mean(first, known)}",
             possible=", ".join(sorted(known)),
@@ -151,6 +153,8 @@ def _usage_error(error: Any, command: str) -> UsageError:
     # click's messages have no verb in these two cases
     sentence = message[:1].lower() + message[1:]
     sentence = re.sub(r"^no such (option|command):? ", r"there is no \1 ", sentence)
+    # With the choices of an enumeration, which is listed line by line.
+    sentence, _, choices_text = sentence.partition(". Choose from:")
     sentence = re.sub(r"^missing ((?:option|argument) .*)", r"the \1 is missing", sentence)
     sentence = re.sub(r"^got unexpected extra argument\S* \((.*)\)$", r"'\1' is more than it takes", sentence)
     # for a group of commands whose subcommand is missing or unknown
@@ -159,6 +163,8 @@ def _usage_error(error: Any, command: str) -> UsageError:
     meant = f"; did you mean {near[0]!r}?" if near else did_you_mean(mistaken, choices)
     possible = ", ".join(sorted(near) if near else choices)
     usage = _usage(context)
+    if choices_text:
+        possible = " ".join(choices_text.split())
     if usage and sentence == "there is no option --out":
         # Other commands have it, and the nearest option, --to, is a time.
         possible, meant = usage, ": the output is an argument"

@@ -126,6 +126,13 @@ def open_lines(path: Path, layout: Layout) -> Iterator[LineFile]:
         raise UsageError(
             f"{path} is raw binary, which does not define its layout", hint="--dtype and --pixels"
         )
+    elif kind is None and path.is_dir():
+        recording = (path / "zarr.json").exists()
+        raise UsageError(
+            f"{path} is a directory, and not a file of lines",
+            possible=", ".join(KINDS),
+            hint="acquire info and acquire export, if it is a recording already" if recording else "",
+        )
     elif kind is None:
         raise UsageError(
             f"the format of {path} cannot be taken from its name",

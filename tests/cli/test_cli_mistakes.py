@@ -121,6 +121,26 @@ HOME = "try: $HOME in place of ~, which the shell replaces only at the beginning
         (("export", "run.zarr"), 2, "possible: acquire export [OPTIONS]"),
         (("info", "run.zarr", "cal.zarr"), 2, "info: 'cal.zarr' is more than it takes\n  possible: acquire"),
         (("help", "start"), 2, "try: acquire start --help"),
+        (("--config", "rig-demo", "serve"), 2, "try: acquire serve --help"),
+        (("completion",), 2, "the argument 'SHELL' is missing\n  possible: bash, zsh, fish"),
+        # a shell's variable that is not set: "" was the current directory, or another rig
+        (("simulate", "scene-leds", "--out", ""), 2, "the path is empty"),
+        (("simulate", "scene-leds", "--out", "x.zarr", "--config", ""), 2, "rig file '' does not exist"),
+        (("cut", "run.zarr", "--out", ""), 2, "the path is empty"),
+        (("export", "run.zarr", ""), 2, "the path is empty"),
+        (("render", "", "--out", "x.mp4"), 2, "the path is empty"),
+        (("calibrate", "show", ""), 2, "the path is empty"),
+        (("upload", "run.zarr", ""), 2, "the path is empty"),
+        (("status", "--socket", ""), 2, "the path is empty"),
+        (("start", ""), 2, "the path is empty"),
+        # what is no file of lines, and no port
+        (
+            ("import", "run.zarr", "--out", "x.zarr", "--config", "rig-demo"),
+            2,
+            "is a directory, and not a file",
+        ),
+        (("trigger", "info", "--url", "/dev/null"), 5, "/dev/null is not a serial port"),
+        (("trigger", "info", "--url", "file"), 5, "file is not a serial port"),
     ],
 )
 def test_a_mistake_is_told_with_what_to_try(

@@ -70,6 +70,9 @@ class SerialTransport:
                 raise TriggerError(f"{url} cannot be opened: {error}", hint=hint) from error
             ports = ", ".join(sorted(port.device for port in comports()))
             what = "is not there" if not Path(url).exists() else f"cannot be opened: {error}"
+            # pyserial has the number in its text alone
+            if Path(url).exists() and (not Path(url).is_char_device() or f"({errno.ENOTTY}, " in str(error)):
+                what = "is not a serial port"
             raise TriggerError(
                 f"{url} {what}", possible=ports or "no serial port", hint="check cable and power"
             ) from error
