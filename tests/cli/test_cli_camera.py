@@ -119,7 +119,7 @@ def test_wrong_arguments_change_nothing(cli: Cli, tmp_path: Path) -> None:
         ),
         (("SIM-A", "-c", "rig-demo", "--out", taken), "exists and is not overwritten"),
         (("SIM-A", "-c", "rig-demo", "--out", tmp_path / "x.jpg"), "possible: .png, .npy"),
-        (("SIM-A", "-c", "rig-demo", "--out", ""), "try: --out snapshot.png"),
+        (("SIM-A", "-c", "rig-demo", "--out", ""), "the path is empty"),
     ):
         answer = cli("camera", "snapshot", *words)
         assert (answer.code, text in answer.err) == (2, True), answer.err
