@@ -68,7 +68,8 @@ def _lock(fd: int, path: Path) -> bool:
                 ) from error
             time.sleep(_AGAIN_S)
         except OSError as error:
-            if error.errno not in NO_LOCKS:
+            # EBADF: NFS locks for writing only what is open for it, which a directory never is.
+            if error.errno not in (*NO_LOCKS, errno.EBADF):
                 raise
             return False
         else:
