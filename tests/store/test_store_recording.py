@@ -298,7 +298,7 @@ def test_what_is_not_a_recording_says_so(path, tmp_path):
     with pytest.raises(PlaceError, match="not a recording: it holds no"):
         open_recording(tmp_path)
     zarr.create_group(tmp_path / "other.zarr")
-    with pytest.raises(PlaceError, match=r"format None.*possible: 'acquire-recording/1', 'acq"):
+    with pytest.raises(PlaceError, match=r"it states no format.*possible: 'acquire-recording/1', 'acq"):
         open_recording(tmp_path / "other.zarr")
 
 
