@@ -87,10 +87,7 @@ def find_bends(
     if len(orders) < 2 or waves.at_rest:
         return bent
     if bent is not None:
-        near = _nearby(waves, bent, len(bent) // 2)
-        for order in (each for each in orders if 2 * each > len(bent)):
-            near = _better(waves, near, _nearby(waves, near, order))
-        return near
+        return _again(waves, bent, orders)
     least = adds_up / WORTH_BENDING
     starts: list[tuple[Path, int]] = []
     if straight is not None:
@@ -107,6 +104,16 @@ def find_bends(
         if _share(waves, found) > WORTH_BENDING * least:
             best = found if best is None else _better(waves, best, found)
     return best
+
+
+def _again(waves: Waves, bent: Path, orders: list[int]) -> Path:
+    """The best path near one that is known, or one with more polynomials near where it leads."""
+    near = _nearby(waves, bent, len(bent) // 2)
+    if more := [each for each in orders if 2 * each > len(bent)]:
+        tracked = _among_all(waves, displacements(near, len(waves.amplitudes)))
+        for order in more:
+            near = _better(waves, near, _nearby(waves, _smooth(tracked, order), order))
+    return near
 
 
 def _better(waves: Waves, path: Path, more: Path) -> Path:

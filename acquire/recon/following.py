@@ -95,6 +95,10 @@ def _on_bends(volume: Trial, candidate: Candidate, rival: float) -> tuple[Trial,
     count = _enough_cosines(found, again)
     found = bench.attempt(replace(again, coefficients=count), NEXT_ITERATIONS, found)
     at_rest = bench.attempt(replace(still, coefficients=count), NEXT_ITERATIONS, at_rest)
+    # More cosines show more of the path.
+    finer = drifting(found)
+    if finer is not None and len(finer.drift) > len(found.candidate.drift):
+        found = better(found, finer)
     return found, min(at_rest, volume, key=_error)
 
 
