@@ -366,9 +366,11 @@ class Workbench:
             self.clock.show("choose", partial(self.video, trial))
         return trial
 
-    def probe(self, candidate: Candidate, rival: float, hopeless: float = HOPELESS) -> Trial:
-        """Solve a candidate from zero; it ends early if its error is ``hopeless`` times that of a rival."""
-        first = self.attempt(candidate, PROBE)
+    def probe(
+        self, candidate: Candidate, rival: float, hopeless: float = HOPELESS, start: Trial | None = None
+    ) -> Trial:
+        """Solve a candidate; it ends early if its error is ``hopeless`` times that of a rival."""
+        first = self.attempt(candidate, PROBE, start)
         if first.error > hopeless * rival:
             return first
         return self.attempt(candidate, FIRST_ITERATIONS - PROBE, first)

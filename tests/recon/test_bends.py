@@ -140,9 +140,9 @@ def test_what_falls_and_swings_is_followed(
 
 
 def test_what_hops_fast_is_not_taken_for_something_that_flows() -> None:
-    recorded = record("hopper", 1, lines=135)
+    recorded = record("hopper", 8, stages=80, lines=135)
     truth = recorded.truth(3, 1)
-    found = reconstruct(recorded.segment, 3, 1)
+    found = reconstruct(recorded.segment, 3, 1, "fast")
     assert found.parameters["prior"] == "volume"
     # A smooth volume, which predicts as well, is no better than the mean over time.
     mean = np.broadcast_to(truth.mean(axis=0), truth.shape)
