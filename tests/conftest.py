@@ -33,7 +33,7 @@ from acquire.cores import limit_blas, usable_cores
 from acquire.forward.kernels import transpose_frames
 from acquire.processes.nursery import warm_up
 
-pytest_plugins = ["left_out"]
+pytest_plugins = ["left_out", "unforced"]
 
 POOL_THREADS = re.compile(r"asyncio_\d+|zarr|fsspec|pydevd|AnyIO worker thread")
 """Worker threads that libraries keep for reuse; they hold nothing of a test."""
