@@ -61,12 +61,12 @@ def learned_path() -> Path:
 def remember(found: Iterable[Learned], path: Path | None = None) -> Path:
     """Add results to the file; they replace earlier ones of the same case.
 
-    Raises OSError if the disk refuses, and leaves the file as it was.
+    Raises OSError if the disk refuses, or the earlier ones cannot be read; the file is then as it was.
     """
     path = path or learned_path()
     known = {
         (each.solver, each.preset, each.spatial_merge, each.temporal_merge, each.voxels, each.scene): each
-        for each in [*recall(path), *found]
+        for each in [*_read(path), *found]
     }
     path.parent.mkdir(parents=True, exist_ok=True)
     document = {"version": VERSION, "learned": [asdict(each) for each in known.values()]}
@@ -78,12 +78,20 @@ def remember(found: Iterable[Learned], path: Path | None = None) -> Path:
 
 
 def recall(path: Path | None = None) -> list[Learned]:
-    """Return the results in the file; none if it is absent, damaged or not ours."""
+    """Return the results in the file; none if it is absent, cannot be read, is damaged or not ours."""
     try:
-        document = json.loads((path or learned_path()).read_text(encoding="utf-8"))
+        return _read(path or learned_path())
+    except OSError:
+        return []
+
+
+def _read(path: Path) -> list[Learned]:
+    """Return the results in the file; none if it is absent, damaged or not ours. Raises OSError."""
+    try:
+        document = json.loads(path.read_text(encoding="utf-8"))
         known = document["learned"] if document["version"] == VERSION else []
         return TypeAdapter(list[Learned]).validate_python(known)
-    except (OSError, ValueError, TypeError, KeyError):
+    except (FileNotFoundError, ValueError, TypeError, KeyError):
         return []
 
 

@@ -68,8 +68,9 @@ def test_without_results_of_that_size_the_one_tried_on_most_scenes_counts():
         assert choose(known, 10.0, 1000, (2, 2)).preset == "balanced"
 
 
-@pytest.mark.parametrize("step", ["os.fsync", "pathlib.Path.replace"])
+@pytest.mark.parametrize("step", ["os.fsync", "pathlib.Path.replace", "pathlib.Path.read_text"])
 def test_a_disk_that_refuses_leaves_the_results_as_they_were(tmp_path, monkeypatch, step):
+    """Results of hours were replaced by the latest alone if they could not be read at that moment."""
     path = tmp_path / "t.json"
     remember(FAST, path)
 
