@@ -66,6 +66,19 @@ def _rebuild(cls: type[AcquireError], message: str, possible: str, hint: str) ->
     return cls(message, possible=possible, hint=hint)
 
 
+def add_failure(error: BaseException, doing: str, later: Exception) -> None:
+    """Add to ``error``, the only one that will be raised, what failed after it, while ``doing`` something.
+
+    An AcquireError gets it in its message: notes are neither shown to users nor sent to other processes.
+    """
+    text = later.message if isinstance(later, AcquireError) else str(later)
+    if not isinstance(error, AcquireError):
+        error.add_note(f"{doing}: {text}")
+    elif text not in error.message:
+        error.message += f"; then, {doing}: {text}"
+        error.args = (error.message,)
+
+
 class UsageError(AcquireError):
     """The request cannot be fulfilled as it stands."""
 

@@ -440,5 +440,7 @@ def error_body(error: AcquireError) -> dict[str, Any]:
 
 def release_error(error: OSError) -> DeviceError:
     """Return the error of a run whose devices were not closed in order."""
-    what = f"the devices could not be released in order: {error}"
+    what = "; ".join(
+        [f"the devices could not be released in order: {error}", *getattr(error, "__notes__", ())]
+    )
     return DeviceError(what, hint="acquire devices shows whether each can be opened again")

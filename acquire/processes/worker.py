@@ -193,14 +193,15 @@ class Worker:
             f"{self.name}: {self.death}", hint="look into the log of this program, and the kernel's"
         )
 
-    def end(self, deadline: float) -> None:
+    def end(self, deadline: float) -> AcquireError | None:
         """End the process: by `Quit` until the monotonic ``deadline``, then by force. Idempotent.
 
-        A process stopped by a signal is waited for only briefly. Raises DeviceError, after the end, if it had
+        A process stopped by a signal is waited for only briefly. Returns an error that it reported and nobody
+        has read, for example of a camera that cannot be closed. Raises DeviceError, after the end, if it had
         to be killed.
         """
         if self.pipe.closed:
-            return
+            return None
         self.post(Quit())
         ran_s = time.monotonic()
         while self._child.exit_code() is None and (now_s := time.monotonic()) < deadline:
@@ -214,6 +215,7 @@ class Worker:
         if forced:
             self._child.kill()
             self._child.exit_code(_KILL_WAIT_S)
+        reported = self._unread_error()
         self.pipe.close()
         if self._child.exit_code() is None:
             self._child.close()
@@ -227,6 +229,13 @@ class Worker:
                 f"{self.name}: the process did not end when told to, and was killed",
                 hint="acquire devices shows whether its device answers; what it had not written yet is lost",
             )
+        return reported
+
+    def _unread_error(self) -> AcquireError | None:
+        found = None
+        while (message := self.message()) is not None:
+            found = message.error if isinstance(message, Failed) else found
+        return found
 
 
 def _main(pipe: Connection[Any, Any], name: str, target: Callable[..., None], *args: Any) -> None:

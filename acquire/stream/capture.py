@@ -5,7 +5,8 @@
     arm     memory → recorder, grabbers → cameras armed → trigger → tags flow
     close   recording → tags → trigger → grabbers → recorder → memory
 
-The first failure is the one reported. A capture is used once: armed, then closed.
+The first failure is the one raised, and its message names later ones. A capture is used once: armed, then
+closed.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ from dataclasses import asdict, replace
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
-from acquire.errors import AcquireError, DataError, StateError, UsageError
+from acquire.errors import AcquireError, DataError, StateError, UsageError, add_failure
 from acquire.lines import ARMS
 from acquire.processes.messages import Quit, Ready
 from acquire.processes.shared import Counters
@@ -97,7 +98,7 @@ class Capture:
             try:
                 self.close(_UNDO_S)
             except (AcquireError, OSError) as second:
-                error.add_note(f"while undoing it: {second}")
+                add_failure(error, "while undoing it", second)
             raise
 
     def start(self, begin: Begin) -> None:
@@ -444,7 +445,7 @@ class Capture:
         # All get Quit before any is waited for, so that they end in parallel. The recorder comes last: it
         # empties the rings that the grabbers fill.
         order = sorted(self._workers, key=RECORDER.__eq__)
-        _run_all(*(partial(self._workers[name].end, deadlines[name]) for name in order))
+        _run_all(*(partial(_end, self._workers[name], deadlines[name]) for name in order))
 
     def _settle_books(self, arms: tuple[str, ...]) -> None:
         for arm in arms:
@@ -477,13 +478,22 @@ class Capture:
                     ring.close()
 
 
+def _end(worker: Worker, deadline: float) -> None:
+    """End a process. Raises what it reported while ending, or DeviceError if it had to be killed."""
+    if (error := worker.end(deadline)) is not None:
+        raise error
+
+
 def _run_all(*steps: Callable[[], None]) -> None:
-    """Take every step, even if earlier ones fail; then raise the first error."""
+    """Take every step, even if earlier ones fail; then raise the first error, with the later ones in it."""
     first: AcquireError | OSError | None = None
     for step in steps:
         try:
             step()
         except (AcquireError, OSError) as error:
-            first = first or error
+            if first is None:
+                first = error
+            else:
+                add_failure(first, "while ending", error)
     if first is not None:
         raise first

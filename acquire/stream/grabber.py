@@ -18,10 +18,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from acquire.camera.base import LossCause
-from acquire.errors import AcquireError, CameraError, CameraLostError
+from acquire.errors import AcquireError, CameraError, CameraLostError, add_failure
 from acquire.lines import LineFlag
 from acquire.processes.messages import Ready
 from acquire.processes.rank import become_prompt, become_urgent
+from acquire.processes.worker import OwnerGone
 from acquire.stream.lineclock import LineClock
 from acquire.stream.losses import Cause, Loss, LossLog
 
@@ -101,39 +102,41 @@ def grab(mailbox: Mailbox, *arms: tuple[GrabberPlan, Ring, Counters]) -> None:
                 camera = _open_again(mailbox, plan, lost.message)
                 for intake in intakes:
                     intake.realign()
-    except BaseException as error:  # the only way out: `Mailbox.take` raises on Quit as well
+    except OwnerGone:  # the usual end: a camera that cannot be closed, and may still be running, is its error
+        _shut_down(camera)
+        raise
+    except BaseException as error:
         try:
             _shut_down(camera)
         except AcquireError as second:
-            error.add_note(f"while closing the camera: {second}")
+            add_failure(error, "while closing the camera", second)
         raise
 
 
 def _open_again(mailbox: Mailbox, plan: GrabberPlan, why: str) -> Camera:
     """Return the camera, open and armed. Raises CameraLostError if that does not succeed in time."""
     deadline = time.monotonic() + plan.reopen_timeout_s
-    while (camera := _try_open(plan)) is None:
-        if time.monotonic() >= deadline:
-            raise CameraLostError(
-                f"camera {plan.arm} is gone: {why}; it did not come back within {plan.reopen_timeout_s:g} s",
-                hint="check cable and power, then arm again",
-            )
+    while True:
+        try:
+            return _open_armed(plan)
+        except CameraError as error:
+            if time.monotonic() >= deadline:
+                away = f"it did not come back within {plan.reopen_timeout_s:g} s ({error.message})"
+                raise CameraLostError(
+                    f"camera {plan.arm} is gone: {why}; {away}", hint="check cable and power, then arm again"
+                ) from error
         mailbox.take()  # raises OwnerGone once the run is over
         time.sleep(_REOPEN_PAUSE_S)
-    return camera
 
 
-def _try_open(plan: GrabberPlan) -> Camera | None:
-    try:
-        camera = plan.opener()
-    except CameraError:
-        return None
+def _open_armed(plan: GrabberPlan) -> Camera:
+    camera = plan.opener()
     try:
         camera.arm()
     except CameraError:
         with contextlib.suppress(AcquireError):
             _shut_down(camera)
-        return None
+        raise
     return camera
 
 

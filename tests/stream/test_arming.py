@@ -41,9 +41,32 @@ def test_arm_undoes_everything_when_something_fails(
     capture = Capture(bench.plan, bench.trigger)
     with pytest.raises(kind) as failure:
         capture.arm(timeout_s=6.0 if fault == "hang" else 60.0)
+    later = "; then, while undoing it: grabber b: the process did not end when told to, and was killed"
+    text = text.replace("; try", f"{later}; try") if fault == "hang" else text
     assert str(failure.value) == text
     assert bench.trigger.stops == (fault == "trigger")
     assert capture.poll() == CaptureStatus()
+    bench.wire.close()
+
+
+@pytest.mark.parametrize("refused", [False, True])
+def test_what_cannot_be_ended_is_reported_with_the_error_before_it(*, refused: bool) -> None:
+    """Only the first was, and that of a camera at the usual end to nobody: it was left running."""
+    bench = make_bench()
+    bench.wire["stuck_b"] = bench.trigger.stuck = True
+    bench.trigger.refuse = refused
+    capture = Capture(bench.plan, bench.trigger)
+    first = "the run is too fast; then, while undoing it: " if refused else ""
+    if refused:
+        with pytest.raises(TriggerError) as failure:
+            capture.arm(timeout_s=60.0)
+    else:
+        capture.arm(timeout_s=60.0)
+        with pytest.raises(TriggerError) as failure:
+            capture.close()
+    left = "the trigger does not answer; then, while ending: the camera does not stop"
+    assert str(failure.value) == first + left
+    assert bench.trigger.stops == 1
     bench.wire.close()
 
 

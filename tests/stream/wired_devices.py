@@ -26,7 +26,7 @@ STAGES, SUBSTEPS, PIXELS, WHITE = 8, 3, 8, 4095
 DEPTH = STAGES + 1
 CLOCK_HZ = 90_000_000
 SUBSTEP_TICKS = 900
-FAULTS = ("stall", "drop", "raise", "die", "bug")
+FAULTS = ("stall", "drop", "raise", "die", "bug", "stuck")
 SATURATED_EVERY = 1000
 
 CODE = PrbsCode(64, 0xACE1)
@@ -118,7 +118,8 @@ class CountingCamera:
         block.pixels[:] = 0  # a reader that kept it would notice
 
     def disarm(self) -> None:
-        """Nothing to stop."""
+        if self._fault("stuck"):
+            raise CameraError("the camera does not stop", hint="unplug it")
 
     def statistics(self) -> dict[str, int]:
         return {"lines": self.next_line, "lost": 0}
@@ -133,13 +134,14 @@ class CountingCamera:
 class WireTrigger:
     """Issues pulses at ``rate_hz``, whatever the run's ticks say.
 
-    ``mute``: no tags; ``refuse``: no run; ``hold_up_s``: how long the next wait for tags takes.
+    ``mute``: no tags; ``refuse``: no run; ``hold_up_s``: how long the next wait for tags takes; ``stuck``:
+    it does not report how many pulses there were.
     """
 
     def __init__(self, wire: Counters, rate_hz: float) -> None:
         self.wire = wire
         self.rate_hz = rate_hz
-        self.mute = self.refuse = False
+        self.mute = self.refuse = self.stuck = False
         self.hold_up_s = 0.0
         self.broken: Exception | None = None
         self.shift = 0
@@ -181,6 +183,8 @@ class WireTrigger:
         self.stops += 1
         if not self.wire["stop_ns"]:
             self.wire["stop_ns"] = time.monotonic_ns()
+        if self.stuck:
+            raise TriggerError("the trigger does not answer")
         return issued(self.wire, self.rate_hz)
 
     def statistics(self) -> dict[str, Any]:
