@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 from acquire.clock import NS_PER_S
 from acquire.lines import ARMS
 from acquire.stream.grabber import CAMERA_CAUSES
+from acquire.stream.session import ExternalState
 from acquire.stream.stalls import HELD_UP_S
 from acquire.stream.watcher import VERDICTS
 
@@ -18,6 +19,7 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from acquire.processes.shared import Counters
+    from acquire.stream.lightcheck import Verdict
 
 RECORDER, TRIGGER, WATCHER = "recorder", "trigger", "watcher"
 """Keys of the counters, and of the workers; the grabbers have their arms' names."""
@@ -51,23 +53,9 @@ class ExternalCounts:
         """Begin a recording: the trigger's earlier counts do not belong to it."""
         self._begun = self._counts()
 
-    def trigger(self) -> dict[str, int]:
-        """Return the trigger's counts since `begin`; of strobes, since arm: a camera behind stays behind."""
-        return {
-            name: count if name.startswith("strobe") else count - self._begun.get(name, 0)
-            for name, count in self._counts().items()
-        }
-
-    def cameras(self) -> dict[str, dict[str, int]]:
-        """Return, per arm, the lines that its camera delivered and lost since it was armed.
-
-        A block that is just being taken counts as ``delivered`` already, while ``next_line`` is still its
-        first line.
-        """
-        return {
-            arm: {str(name): counted[name] for name in CAMERA_COUNTS if counted[name]}
-            for arm, counted in self._cameras.items()
-        }
+    def state(self) -> ExternalState:
+        """Return what the others have counted and found by now."""
+        return ExternalState(self._since_begin(), self._delivered(), self._doubted(), self._verified())
 
     def tags_pass_since_s(self, now_s: float) -> float:
         """Return the monotonic time since which tags are passed on without a hold-up; ``now_s`` in one."""
@@ -78,25 +66,39 @@ class ExternalCounts:
         is_held_up = HELD_UP_S < still_s < _LONGEST_HOLD_UP_S
         return now_s if is_held_up else self._trigger["held_up_to_ns"] / NS_PER_S
 
-    def doubted(self) -> set[str]:
-        """Return the arms whose lines contradict the code."""
-        watcher = self._watcher
-        if watcher is None:
-            return set()
-        return {arm for arm in ARMS if VERDICTS[watcher[f"verdict_{arm}"]].doubtful}
-
-    def verified(self) -> dict[str, int]:
-        """Return, per arm, the line up to which the light follows the code; empty without a watcher."""
-        watcher = self._watcher
-        return {} if watcher is None else {arm: watcher[f"verified_line_{arm}"] for arm in ARMS}
-
     def doubt(self) -> str:
         """Return the doubtful verdicts in words; "" if there are none."""
+        verdicts = ((arm, verdict) for arm, verdict in self._verdicts().items() if verdict.doubtful)
+        return ", ".join(f"arm {arm} {verdict}".replace("_", " ") for arm, verdict in verdicts)
+
+    def _since_begin(self) -> dict[str, int]:
+        """Return the trigger's counts since `begin`; of strobes, since arm: a camera behind stays behind."""
+        return {
+            name: count if name.startswith("strobe") else count - self._begun.get(name, 0)
+            for name, count in self._counts().items()
+        }
+
+    def _delivered(self) -> dict[str, dict[str, int]]:
+        """Return, per arm, the lines that its camera delivered and lost since it was armed.
+
+        A block that is just being taken counts as ``delivered`` already, while ``next_line`` is still its
+        first line.
+        """
+        return {
+            arm: {str(name): counted[name] for name in CAMERA_COUNTS if counted[name]}
+            for arm, counted in self._cameras.items()
+        }
+
+    def _verdicts(self) -> dict[str, Verdict]:
         watcher = self._watcher
-        if watcher is None:
-            return ""
-        verdicts = {arm: VERDICTS[watcher[f"verdict_{arm}"]] for arm in sorted(self.doubted())}
-        return ", ".join(f"arm {arm} {verdict}".replace("_", " ") for arm, verdict in verdicts.items())
+        return {} if watcher is None else {arm: VERDICTS[watcher[f"verdict_{arm}"]] for arm in ARMS}
+
+    def _doubted(self) -> frozenset[str]:
+        return frozenset(arm for arm, verdict in self._verdicts().items() if verdict.doubtful)
+
+    def _verified(self) -> dict[str, int]:
+        watcher = self._watcher
+        return {} if watcher is None else {arm: watcher[f"verified_line_{arm}"] for arm in ARMS}
 
     def _counts(self) -> dict[str, int]:
         return {} if self._trigger is None else {name: self._trigger[name] for name in TRIGGER_COUNTERS}

@@ -335,7 +335,7 @@ class Recorder:
         assert self._tagger is not None
         session = Session(writer, self._tagger, self._blank, first_line, opening.lines_from(first_line))
         self._external.begin()
-        session.doubted = self._external.doubted()
+        session.others = self._external.state()
         window = opening.begin.window
         if window.padded:
             session.before = Cause.RECORDER_LOST
@@ -462,8 +462,7 @@ class Recorder:
     # ---- the current recording
 
     def _update(self, session: Session) -> None:
-        session.doubted, session.verified = self._external.doubted(), self._external.verified()
-        session.trigger, session.cameras = self._external.trigger(), self._external.cameras()
+        session.others = self._external.state()
         looked_s = time.monotonic()
         for name, arm in self._arms.items():
             # Once more: an arm whose lines came while the disk held up this loop is not silent.

@@ -164,6 +164,24 @@ class Book:
         }
 
 
+@dataclass(frozen=True, slots=True)
+class ExternalState:
+    """Counts and findings of the others at one moment of a recording.
+
+    Attributes
+    ----------
+    trigger : the trigger's counts during this recording
+    cameras : arm → the camera's counts since it was armed
+    doubted : arms whose lines contradict the code at the moment: their next lines are flagged
+    verified : arm → the line up to which it is known to follow the light's code
+    """
+
+    trigger: dict[str, int] = field(default_factory=dict)
+    cameras: dict[str, dict[str, int]] = field(default_factory=dict)
+    doubted: frozenset[str] = frozenset()
+    verified: dict[str, int] = field(default_factory=dict)
+
+
 class Session:
     """See the module. Methods raise the writer's errors; only `close` can follow then.
 
@@ -173,10 +191,7 @@ class Session:
     ----------
     writer : the recording's, which has the arms' last blocks until it has given them back
     lost : arm → why it will deliver no more
-    doubted : arms whose lines contradict the code at the moment: their next lines are flagged
-    trigger : the trigger's counts during this recording
-    cameras : arm → the camera's counts since it was armed
-    verified : arm → the line up to which it is known to follow the light's code
+    others : what trigger, cameras and watcher have counted and found so far
     left_out : arm → lines that were taken, but that a failed disk did not keep; negative: lines that are on
         disk although they were not counted as taken
     surplus : arm → lines that were taken before the other arm's ring overflowed at an earlier line: not part
@@ -195,13 +210,10 @@ class Session:
         self.lost: dict[str, Cause] = {}
         self.before = Cause.MIXED
         """Cause of missing lines before an arm's first block for which the block states none."""
-        self.doubted: set[str] = set()
-        self.trigger: dict[str, int] = {}
-        self.cameras: dict[str, dict[str, int]] = {}
+        self.others = ExternalState()
         self.left_out: dict[str, int] = {}
         self.surplus: dict[str, int] = {}
         self.bridges_to = -1
-        self.verified: dict[str, int] = {}
         self.writer = writer
         self._tagger = tagger
         self._blank = blank
@@ -249,7 +261,7 @@ class Session:
         if self.reached(arm):
             return 0
         tagged = self._tagger.tag(arm, block.part(book.next_line, self.end_line))
-        if arm in self.doubted:
+        if arm in self.others.doubted:
             tagged = replace(tagged, flags=tagged.flags | np.uint16(LineFlag.CODE_CONTRADICTED))
             book.doubted += len(tagged)
         # Packing takes longer than writing: it is done in parallel, while the other arm's lines are taken.
@@ -399,7 +411,7 @@ class Session:
         """Return the reasons to doubt stored lines, each with its count."""
         reasons = {"tag_mismatches": self._mismatches, **self._doubts}
         for name in TAINTING:
-            reasons[name] = self.trigger.get(name, 0)
+            reasons[name] = self.others.trigger.get(name, 0)
         for arm, book in self.books.items():
             reasons |= {
                 f"unconfirmed_{arm}": book.unverified,
@@ -411,15 +423,15 @@ class Session:
     def _ledger(self) -> dict[str, Any]:
         # A recording that the disk ended may have had no end line yet.
         end = min(self.end_line, max(book.next_line for book in self.books.values()))
-        lines = end - self.first_line
+        lines, others = end - self.first_line, self.others
         arms = {arm: book.to_attrs(lines) for arm, book in self.books.items()}
         return {
             "pulses": lines,
             "tag_mismatches": self._mismatches,
-            "trigger": self.trigger,
-            "cameras": self.cameras,
+            "trigger": others.trigger,
+            "cameras": others.cameras,
             "tainted_by": self._taints(),
-            **({"code_verified_to": self.verified} if self.verified else {}),
+            **({"code_verified_to": others.verified} if others.verified else {}),
             **({"events_not_listed": more} if (more := self.writer.events_not_listed) else {}),
             **arms,
         }
