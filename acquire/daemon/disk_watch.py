@@ -61,6 +61,7 @@ class DiskWatch:
     directory : directory of recordings for which no path is given
     reserve_bytes : bytes of its disk that recordings leave free
     expected_bytes_per_s : uncompressed rate of the cameras, and of the copies on the same disk
+    free_bytes, now_s : as measured by the disk and the clock
     look, take_other : see `Place`
     """
 
@@ -69,6 +70,7 @@ class DiskWatch:
         directory: Path,
         reserve_bytes: int,
         expected_bytes_per_s: float,
+        *,
         free_bytes: Callable[[Path], int] = lambda path: shutil.disk_usage(path).free,
         now_s: Callable[[], float] = time.monotonic,
         look: Callable[[], Trouble | None] = lambda: None,

@@ -94,8 +94,15 @@ def serve(config: RigConfig, origin: str = "", reread: Callable[[], RigConfig] |
             check_rig(config)
             return Run(config, rig, proof.choose, devices, request.code)
 
-        disk = disk_watch(config, claim)
-        service = Service(config, open_run, proof, salvage, uploads, troubles, disk)
+        service = Service(
+            config,
+            open_run,
+            prove=proof,
+            salvage=salvage,
+            uploads=uploads,
+            troubles=troubles,
+            disk=disk_watch(config, claim),
+        )
         service.origin = origin
         page, hooks = Page(endpoint.path), Hooks(config.hooks, service.news, config.name)
         reloading = None if reread is None else Reloading(reread, service, hooks)

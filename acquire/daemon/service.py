@@ -57,6 +57,7 @@ class Service:
         self,
         config: RigConfig,
         open_run: OpenRun,
+        *,
         prove: Prove | None = None,
         salvage: Salvage | None = None,
         uploads: Uploads | None = None,
@@ -78,8 +79,7 @@ class Service:
         self._born = time.monotonic()
         self._now = Situation()
         self._run: ServiceRun | None = None
-        self._seen = CaptureStatus()
-        self._rates = Rates()
+        self._seen, self._rates = CaptureStatus(), Rates()
         self._disk = disk or disk_watch(config)
         self._order = StandingOrder(config)
         self._take: Take | None = None

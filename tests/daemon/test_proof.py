@@ -147,7 +147,7 @@ def test_the_service_stays_idle_and_asks_no_device(tmp_path: Path) -> None:
     def no_run(request: object) -> None:
         raise AssertionError("devices were opened")
 
-    service = Service(load_rig("rig-demo"), no_run, too_slow)  # type: ignore[arg-type]
+    service = Service(load_rig("rig-demo"), no_run, prove=too_slow)  # type: ignore[arg-type]
     with pytest.raises(UsageError, match="too slow, True"):
         service.arm(ArmRequest(force=True))
     assert service.status().state is State.IDLE

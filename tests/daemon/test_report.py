@@ -108,7 +108,7 @@ class Disk:
         self.clock, self.free, self.answers = Clock(), 10_000, threading.Event()
         self.answers.set()
         self.gone = False
-        self.watch = DiskWatch(Path("/d"), 1000, 100.0, self._free_bytes, self.clock)
+        self.watch = DiskWatch(Path("/d"), 1000, 100.0, free_bytes=self._free_bytes, now_s=self.clock)
 
     def _free_bytes(self, _: Path) -> int:
         assert self.answers.wait(300)
