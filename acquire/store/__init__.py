@@ -4,7 +4,8 @@
 
     whole recordings   writer                     reader, listing     verification recovery mirroring  video
       with             retention room resume      outline suspect     scan         mend     place
-      kept from loss   removal, holds, links      opening attributes  compare      rebuild
+      kept from loss   reserve, holds, links      opening attributes  compare      rebuild
+      removed          removal
       seen at once     overview                   extent shortfall
     videos             video_writer, mosaic_writer (tiles), video_layout (metadata)
     one arm            arm_writer                 camera_stream, present

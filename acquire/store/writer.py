@@ -16,7 +16,7 @@ import json
 import os
 import time
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Self
 
@@ -33,6 +33,7 @@ from acquire.store.plugin_codecs import EncodingError
 from acquire.store.rebuild import write_copy
 from acquire.store.refusals import CURES, refusal
 from acquire.store.removal import RESERVE, Unborn, remove
+from acquire.store.reserve import EndReserve
 from acquire.store.resume import list_segment
 from acquire.store.retention import Keeper, release
 from acquire.store.room import RoomWatch
@@ -51,11 +52,6 @@ if TYPE_CHECKING:
 
 OWN_INTERVAL_S = 1.0
 """How much older than the root the own metadata of a group or an array may be."""
-
-RESERVE_BYTES = 2**21
-"""Bytes kept free for the metadata of the end: more than tables (`table.TEXT_BYTES`) and root take."""
-USUAL_ROOT_BYTES = 2**17
-"""Bytes of them for the root; for a larger one, more are reserved."""
 _DISK_HINT = "check that the directory still exists and the kernel's log for errors of the disk"
 
 
@@ -97,7 +93,7 @@ class RecordingWriter:
         # Zarr readers do not list the contents of an array's directory.
         hidden = path / ARMS[0] / "lines"
         self._publisher = Publisher(hidden / SCRATCH, disk)
-        self._reserve = hidden / RESERVE
+        self._reserve = EndReserve(disk, hidden / RESERVE)
         self._keeper: Keeper | None = None
         self._watch = RoomWatch(disk, path, spec.reserve_bytes)
         self._looked = self._watch.room
@@ -107,7 +103,6 @@ class RecordingWriter:
         self._committed = 0
         self._own_due_s = 0.0
         self._failure: str | None = None
-        self._reserved = RESERVE_BYTES
         self._closed = False
 
     @classmethod
@@ -180,7 +175,7 @@ class RecordingWriter:
             for table in self._tables:
                 table.create(self._disk)
             self._publish_parts(0, own=True)
-            self._disk.reserve(self._reserve, RESERVE_BYTES)
+            self._reserve.create()
             if self._durable:
                 self._disk.sync_tree(self.path)
                 self._disk.sync_directory(self.path.parent)
@@ -332,7 +327,7 @@ class RecordingWriter:
                 rows = min(arm.next_line for arm in self._arms.values()) - self.spec.first_line
                 for arm in self._arms.values():
                     arm.pad()
-            self._disk.remove(self._reserve)  # its room is for what follows: the disk may be full
+            self._reserve.release()  # its room is for what follows: the disk may be full
             self._disk.sync_tree(self.path)  # lines before their metadata
             nodes = self._publish_parts(rows, own=True) | self._publish_overview(rows)
             self._disk.sync_tree(self.path)  # metadata before the root
@@ -414,18 +409,8 @@ class RecordingWriter:
         durable, text = self._durable or ending is not None, layout.to_json(root)
         self._publisher.replace(self.path / "zarr.json", text, durable=durable)
         if ending is None:
-            self._reserve_for(len(text))
+            self._reserve.fit(len(text))
         self._committed = rows  # only now: nothing is acknowledged that a reader would not find
-
-    def _reserve_for(self, root_bytes: int) -> None:
-        """Keep room for the end of a root that has grown: it lists holds, and what was dropped between."""
-        # Root and copy are each written before they replace the old one.
-        if 2 * root_bytes <= self._reserved - RESERVE_BYTES + USUAL_ROOT_BYTES:
-            return
-        more = RESERVE_BYTES + 4 * root_bytes  # enough until it has doubled
-        with suppress(OSError):  # what is reserved stays; the disk is about to end the recording
-            self._disk.reserve_more(self._reserve, more)
-            self._reserved = more
 
     def _publish_copy(self, ending: Ending | None = None) -> None:
         """Write the copy of the root's attributes, in case the root is lost; always before the root."""
