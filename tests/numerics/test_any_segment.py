@@ -79,7 +79,7 @@ def damage(segment: Segment, fault: str, seed: int) -> Segment:
 @given(data=st.data(), seed=st.integers(0, 2**31), fault=st.sampled_from(FAULTS))
 @settings(max_examples=150, deadline=None)
 def test_any_segment_is_solved_or_refused(data: st.DataObject, seed: int, fault: str) -> None:
-    stages, substeps, count = (data.draw(st.integers(1, most)) for most in (12, 4, 40))
+    stages, substeps, count = (data.draw(st.integers(1, most)) for most in (8, 3, 24))
     geometry = Geometry(stages, substeps, count)
     noise = data.draw(st.sampled_from([0.0, 10.0, 300.0]))
     segment = damage(record(geometry, seed, noise), fault, seed)

@@ -84,7 +84,7 @@ def test_calibrated_lines_restore_the_picture(cal: Path, run: Path, tmp_path: Pa
     noisy = open_recording(record(tmp_path / "noise.zarr", lit(NOISE), "target", 200)).cut(0, 200)
     known = open_calibration(cal)
     found = {
-        name: reconstruct(each, 3, 1, iterations=120)
+        name: reconstruct(each, 3, 1, iterations=40)
         for name, each in {
             "raw": replace(segment, balanced=True),
             "by its own lines": segment,

@@ -9,6 +9,7 @@ from __future__ import annotations
 import errno
 import os
 import random
+import tempfile
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -22,6 +23,15 @@ from acquire.store import RecordingWriter, RunCondition, open_recording, recover
 from acquire.store.files import Disk, ShardFile
 
 SECTOR = 512
+MEMORY = Path("/dev/shm")
+
+
+@pytest.fixture
+def tmp_path(tmp_path):
+    """In memory, if possible: most of the time went into removing thousands of small trees from a disk."""
+    parent = MEMORY if MEMORY.is_dir() and os.access(MEMORY, os.W_OK | os.X_OK) else tmp_path
+    with tempfile.TemporaryDirectory(dir=parent, prefix="acquire-test-") as place:
+        yield Path(place)
 
 
 class QuickDisk(Disk):
