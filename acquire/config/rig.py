@@ -22,6 +22,8 @@ from acquire.place import builtin_names, default_socket
 from acquire.plugins import CAMERAS
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from acquire.fibre import Fibre
 
 RING_RESERVE_SHARE = 4
@@ -160,9 +162,15 @@ class SimulationConfig(FrozenModel):
         return {key: value for key, value in table.items() if key != "replay_hold_s"}
 
 
-def _is_recorded(info: ValidationInfo) -> bool:
-    """Whether the rig is that of a recording, whose lines are only read."""
-    return bool(info.context and info.context.get("recorded"))
+def _limit_of_capture(check: Callable[[RigConfig], None]) -> Any:
+    """Make ``check`` a validator of rigs, except those of recordings, whose lines are only read."""
+
+    def validate(rig: RigConfig, info: ValidationInfo) -> RigConfig:
+        if not (info.context and info.context.get("recorded")):
+            check(rig)
+        return rig
+
+    return model_validator(mode="after")(validate)
 
 
 def _default_to_prbs(value: Any) -> Any:
@@ -221,14 +229,12 @@ class RigConfig(FrozenModel):
             raise ValueError(str(error)) from error
         return self
 
-    @model_validator(mode="after")
-    def _ring_fits(self, info: ValidationInfo) -> RigConfig:
+    @_limit_of_capture
+    def _ring_fits(self) -> None:
         """Lines wait in the ring for their tag until half of it is full.
 
         Tags every third of the ring leave a sixth of it for a tag that is late on a busy host.
         """
-        if _is_recorded(info):
-            return self
         lines = self.ring_slots * self.stream.block_lines
         pixel_bytes = 1 if self.cameras.a.dtype == "uint8" else 2
         if (size := lines * self.pixels * pixel_bytes) > MAX_RING_BYTES:
@@ -241,13 +247,10 @@ class RigConfig(FrozenModel):
                 f"trigger.tag_every_lines cannot be {self.trigger.tag_every_lines}; possible: 1 to "
                 f"{lines // 3}, a third of what a ring holds (stream.{self._ring_keys})"
             )
-        return self
 
-    @model_validator(mode="after")
-    def _blocks_come_before_a_stall(self, info: ValidationInfo) -> RigConfig:
+    @_limit_of_capture
+    def _blocks_come_before_a_stall(self) -> None:
         """A camera delivers whole blocks: until one is full, its arm is silent."""
-        if _is_recorded(info):
-            return self
         passing_hz, most_s = self.passing_hz, self.stall_timeout_s / 2
         if (block_s := self.stream.block_lines / passing_hz) > most_s:
             raise ValueError(
@@ -255,13 +258,12 @@ class RigConfig(FrozenModel):
                 f"block takes {block_s:.3g} s; possible: up to {math.floor(passing_hz * most_s)}, half the "
                 "time after which an arm counts as stalled (stream.stall_s, stream.reopen_s)"
             )
-        return self
 
-    @model_validator(mode="after")
-    def _grabbers_leave_time(self, info: ValidationInfo) -> RigConfig:
+    @_limit_of_capture
+    def _grabbers_leave_time(self) -> None:
         """Grabbers that run ahead of everything else must not take all of the processor's time."""
-        if _is_recorded(info) or not self.stream.realtime:
-            return self
+        if not self.stream.realtime:
+            return
         passing_hz = self.passing_hz
         fewest = math.ceil(passing_hz / MOST_URGENT_BLOCKS_PER_S)
         if self.stream.block_lines < fewest:
@@ -270,12 +272,9 @@ class RigConfig(FrozenModel):
                 f"{passing_hz:g} lines/s, {passing_hz / self.stream.block_lines:.0f} blocks/s would keep "
                 f"everything else from running; possible: {fewest} or more, or realtime = false"
             )
-        return self
 
-    @model_validator(mode="after")
-    def _tags_can_be_read(self, info: ValidationInfo) -> RigConfig:
-        if _is_recorded(info):
-            return self
+    @_limit_of_capture
+    def _tags_can_be_read(self) -> None:
         passing_hz = self.passing_hz
         # At 50 000 tags/s the supervisor fell behind, and the run ended as if the camera had not waited for
         # the trigger.
@@ -285,7 +284,6 @@ class RigConfig(FrozenModel):
                 f"trigger.tag_every_lines cannot be {self.trigger.tag_every_lines} at {passing_hz:g} "
                 f"lines/s; possible: {fewest} or more, since the host reads up to {MOST_TAGS_PER_S} tags/s"
             )
-        return self
 
     @model_validator(mode="after")
     def _geometry_matches_cameras(self) -> RigConfig:
@@ -306,11 +304,9 @@ class RigConfig(FrozenModel):
                 )
         return self
 
-    @model_validator(mode="after")
-    def _past_fits(self, info: ValidationInfo) -> RigConfig:
+    @_limit_of_capture
+    def _past_fits(self) -> None:
         """The ring keeps filling while an event is detected and its recording is created."""
-        if _is_recorded(info):
-            return self
         # The delay is in the time of the host, the history in that of the instrument.
         longest_s = self.history_s - EVENT_DELAY_S * self.simulation.speed
         if self.events.sources and self.events.pre_s > longest_s:
@@ -318,7 +314,6 @@ class RigConfig(FrozenModel):
                 f"events.pre_s cannot be {self.events.pre_s:g}; possible: up to {max(0.0, longest_s):.3g}, "
                 f"since the ring holds {self.history_s:.3g} s; stream.ring_seconds makes it longer"
             )
-        return self
 
     @model_validator(mode="after")
     def _arms_apart(self) -> RigConfig:
