@@ -51,12 +51,12 @@ _SIGN_OF_LIFE_S = 0.5
 
 
 @dataclass(frozen=True, slots=True)
-class Reunion:
+class Reconnection:
     """State of the run when a driver reconnects. ``str()`` gives it in words."""
 
     run_id: str | None
     """The run that the driver had prepared or started."""
-    goes_on: bool
+    continues: bool
     """Whether the run is still armed, running, or about to end."""
     lines: int | None
     """Lines started in it; None if it is not the device's latest run any more."""
@@ -88,7 +88,7 @@ class TriggerDriver:
         self._prepared: TriggerRun | None = None
         self._run: TriggerRun | None = None
         self._tags: TagReader | None = None
-        self._owed = 0  # number of a run that could not be stopped without a link
+        self._unstopped = 0  # number of a run that could not be stopped without a link
         self._sign_of_life_s = 0.0
 
     # ---- the protocol of triggers
@@ -100,7 +100,7 @@ class TriggerDriver:
     def prepare(self, run: TriggerRun) -> None:
         """Configure and arm. Preparing the same run again changes nothing, even while it runs."""
         with self._lock:
-            device = self._living()
+            device = self._connected()
             values = register_values(
                 run, self._config, device.capabilities, device.link.transport.bytes_per_s
             )
@@ -118,7 +118,7 @@ class TriggerDriver:
                 return
             if not status.at_rest:
                 # End a run that our stop did not reach, but no run that this driver was not asked to stop.
-                if status.run != self._owed:
+                if status.run != self._unstopped:
                     raise TriggerError(
                         f"run {run.run_id!r} cannot be prepared while another one runs: "
                         f"number {status.run:#018x} is {status}",
@@ -187,7 +187,9 @@ class TriggerDriver:
                 timeout_s = min(timeout_s, patience_s)
             return tags.take(device.link.tags(timeout_s))
         except TriggerError as error:
-            raise TriggerError(f"{error.message}; its tags have reported {tags}", hint=error.hint) from error
+            raise TriggerError(
+                f"{error.message}; its tags have reported {tags}", possible=error.possible, hint=error.hint
+            ) from error
 
     def events(self) -> list[TagEvent]:
         return self._tags.events() if self._tags is not None else []
@@ -196,17 +198,17 @@ class TriggerDriver:
         """End the run after a whole line; return the number of lines. Idempotent."""
         with self._lock:
             run, self._prepared = self._run or self._prepared, None
-            if self._device is None and not self._owed:
+            if self._device is None and not self._unstopped:
                 return 0
             # Noted before the link is used: if it fails, the next `stop` or `prepare` ends this run.
-            self._owed = run_number(run.run_id) if run else self._owed
-            device = self._living()
+            self._unstopped = run_number(run.run_id) if run else self._unstopped
+            device = self._connected()
             # 0, any run: a device that was restarted in the meantime would refuse to stop one that it lacks.
             device.command(Command.STOP, 0)
             # The device ends after a whole line, which may take longer than any answer.
             ticks = device.line_ticks()
             status = device.await_status(lambda status: status.at_rest, ANSWER_S, "end", ticks)
-            self._owed = 0
+            self._unstopped = 0
             # Both waits of `tags`, for the link or for a run, would wait for tags that do not come any more.
             device.link.interrupt()
             with self._stopped:
@@ -251,17 +253,17 @@ class TriggerDriver:
                 raise self._device.link.dead
             return self._device
 
-    def reopen(self) -> Reunion:
+    def reopen(self) -> Reconnection:
         """Reconnect, and return the state of the run. Nothing is started or stopped."""
         with self._lock:
             self.release()  # also a link that lives: its port can be opened once
             run, status = self._run or self._prepared, self.device().status()
             if run is None:
-                return Reunion(None, False, None, status)
+                return Reconnection(None, False, None, status)
             if status.run == run_number(run.run_id):
-                return Reunion(run.run_id, not status.at_rest, status.lines, status)
+                return Reconnection(run.run_id, not status.at_rest, status.lines, status)
             self._run = self._prepared = self._tags = None
-            return Reunion(run.run_id, False, None, status)
+            return Reconnection(run.run_id, False, None, status)
 
     def release(self) -> None:
         """Close the link and leave the device as it is. Idempotent."""
@@ -270,7 +272,7 @@ class TriggerDriver:
             if device is not None:
                 device.link.close()
 
-    def _living(self) -> Device:
+    def _connected(self) -> Device:
         """Return the device, replacing a dead link."""
         if self._device is not None and self._device.link.dead is not None:
             self.release()

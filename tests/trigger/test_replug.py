@@ -90,9 +90,9 @@ def test_a_run_continues_without_its_host_and_is_found_again(cable, driver) -> N
     lose_it(cable, driver)
     known = driver.statistics()["pulses"]
     cable.plug()
-    reunion = driver.reopen()
-    assert str(reunion) == f"run 'run' is running with {reunion.lines} lines"
-    assert (reunion.goes_on, reunion.lines >= known) == (True, True)
+    found = driver.reopen()
+    assert str(found) == f"run 'run' is running with {found.lines} lines"
+    assert (found.continues, found.lines >= known) == (True, True)
     later = driver.tags(5.0)
     assert all((tag.code_index, tag.tick) == (3 * tag.line, 2700 * tag.line) for tag in later)
     lines = driver.stop()
@@ -110,9 +110,9 @@ def test_a_run_that_ended_in_the_meantime_reports_the_reason(cable) -> None:
     while cable.model.registers.read(r.STATUS.address, 1)[0] & 7 != State.ENDED:
         cable.model.take()
         time.sleep(0.001)
-    reunion = driver.reopen()
-    assert str(reunion) == f"run 'run' is ended with {reunion.lines} lines (watchdog)"
-    assert not reunion.goes_on
+    found = driver.reopen()
+    assert str(found) == f"run 'run' is ended with {found.lines} lines (watchdog)"
+    assert not found.continues
     driver.close()
 
 

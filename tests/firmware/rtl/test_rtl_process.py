@@ -153,7 +153,7 @@ def test_a_process_that_dies_is_an_unplugged_trigger(
     opened[0]._process.kill()
     with pytest.raises(TriggerError, match="is gone"):
         until(lambda: driver.tags(1.0) is None)
-    assert not driver.reopen().goes_on
+    assert not driver.reopen().continues
 
 
 def test_without_a_compiler_the_rig_says_what_to_install(
