@@ -72,10 +72,25 @@ def path_of(resource: dict[str, Any]) -> Path:
     return Path(unquote(urlsplit(resource["uri"]).path))
 
 
+@pytest.fixture(scope="module")
+def running(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Daemon]:
+    with contextlib.closing(Daemon(tmp_path_factory.mktemp("daemon"))) as found:
+        with found.client() as client:  # the first run starts a helper process that stays with the daemon
+            client.arm()
+            client.disarm()
+        yield found
+
+
 @pytest.fixture
-def daemon(tmp_path: Path) -> Iterator[Daemon]:
-    with contextlib.closing(Daemon(tmp_path)) as running:
+def daemon(running: Daemon) -> Iterator[Daemon]:
+    """The daemon of all tests, idle before each."""
+    with running.client() as client:
+        assert client.status().state is State.IDLE
         yield running
+        if client.status().state is State.RECORDING:
+            client.stop()
+        if client.status().state is not State.IDLE:
+            client.disarm()
 
 
 @pytest.fixture(scope="module")
@@ -289,7 +304,7 @@ def test_a_fault_and_a_foreign_stop_fail_the_status_with_an_explanation(
 
 
 def test_a_killed_daemon_fails_the_status_and_its_committed_lines_are_reported(
-    daemon: Daemon, engine: RunEngine, emitted: Emitted, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, engine: RunEngine, emitted: Emitted, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("acquire.bluesky.recorder.PATIENCE_S", 1.0)
 
@@ -298,7 +313,9 @@ def test_a_killed_daemon_fails_the_status_and_its_committed_lines_are_reported(
         daemon.end(signal.SIGKILL)
         return bps.null()
 
-    failure = in_words(engine, fly(Recorder(daemon.socket, name="recorder"), StartRequest(lines=10**7), kill))
+    with contextlib.closing(Daemon(tmp_path)) as daemon:
+        recorder = Recorder(daemon.socket, name="recorder")
+        failure = in_words(engine, fly(recorder, StartRequest(lines=10**7), kill))
     assert str(daemon.socket) in failure
     (recording,) = {path_of(one) for one in emitted.all("stream_resource")}
     assert min(emitted.covered().values()) > 600
