@@ -79,12 +79,12 @@ def run(home: Path, seed: int, outcome: Outcome) -> None:
     disk = MoodyDisk(
         chance.choice(SHARES) * LOAD.bytes_per_s, chance.choice(NAPS), chance.choice(LONGEST_NAPS_S)
     )
-    kills, goes_on = chance.random() < 0.4, chance.random() < 0.8
+    kills, continues = chance.random() < 0.4, chance.random() < 0.8
     wire = Wire()
     model = TriggerModel(wire, CLOCK_HZ, LOAD.speed)
     trigger = TriggerDriver(partial(TwinTransport, model), TriggerConfig(tag_every_lines=LOAD.block_lines))
     plan = capture_plan(replace(LOAD, ring_slots=chance.choice(RING_SLOTS)), wire)
-    capture = Capture(replace(plan, realtime=False, disk=disk, goes_on=goes_on), trigger)
+    capture = Capture(replace(plan, realtime=False, disk=disk, continues=continues), trigger)
     try:
         capture.arm()
         for number in range(TAKES):

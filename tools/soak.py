@@ -193,7 +193,7 @@ def _cycle(path: Path, load: Load, chance: random.Random, found: Soak, cycle_s: 
         arm: FaultyOpener(opener, faults, arm) for arm, opener in plan.openers.items()
     }
     plan = replace(
-        plan, openers=openers, reopen_timeout_s=20.0, stall_timeout_s=25.0, realtime=False, goes_on=True
+        plan, openers=openers, reopen_timeout_s=20.0, stall_timeout_s=25.0, realtime=False, continues=True
     )
     capture = Capture(plan, trigger)
     try:

@@ -188,7 +188,7 @@ def capture_plan(config: RigConfig, rig: Rig, run_id: str) -> CapturePlan:
         realtime=config.stream.realtime,
         line_period_ns=1e9 / config.passing_hz,
         patience_s=config.recording.patience_s,
-        goes_on=config.recording.on_disk_trouble == "continue",
+        continues=config.recording.on_disk_trouble == "continue",
         # A recorder that makes no progress is not waited for longer than the rig allows, nor than any other
         # process.
         seal_timeout_s=min(config.recording.seal_timeout_s, END_S),

@@ -226,7 +226,7 @@ class Capture:
             max_skew_lines=plan.max_skew_lines,
             realtime=plan.realtime,
             disk=plan.disk,
-            goes_on=plan.goes_on,
+            continues=plan.continues,
         )
         return Worker(RECORDER, recorder.record, what, self._rings, self._tags, self._counters)
 

@@ -182,7 +182,7 @@ class Lifecycle:
     notes : recent notes sent to the recorder, which may die before it has written them
     """
 
-    def __init__(self, *, goes_on: bool) -> None:
+    def __init__(self, *, continues: bool) -> None:
         self.stage = Stage.NONE
         self.began: Began | None = None
         self.sealed: Sealed | None = None
@@ -190,7 +190,7 @@ class Lifecycle:
         self.path: Path | None = None
         self.resumption = Resumption()
         self.notes: deque[Note] = deque(maxlen=_MOST_NOTES)
-        self._goes_on = goes_on
+        self._continues = continues
         self._begin: Begin | None = None
         self._end_reason: str | None = None
         self._failed = False
@@ -269,7 +269,7 @@ class Lifecycle:
         if began is None or begin is None or path is None:
             raise refusal(self.stage, Event.SEALED)
         following = None
-        if self._goes_on and sealed.end_line is not None and self._end_reason is None and not self._failed:
+        if self._continues and sealed.end_line is not None and self._end_reason is None and not self._failed:
             following = resumed(begin, began, sealed.end_line, sealed.end_reason)
         self._go(Event.SEALED if following is None else Event.DISK_END)
         for arm, ranges in self._kept.items():

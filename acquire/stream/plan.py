@@ -54,7 +54,7 @@ class CapturePlan:
     patience_s : a recorder that waits longer for the disk is a fault, and one that shows no life for
         another reason is replaced; None: wait for the disk without limit, and for the recorder
         `PATIENT_RINGS` times as long as the rings hold lines, at least ``stall_timeout_s``
-    goes_on : a recording that ended because the disk was too slow continues in a further segment
+    continues : whether a recording that ended because the disk was too slow has a further segment
     seal_timeout_s : when the capture is closed, a recording of which nothing more reaches the disk for this
         long is given up, and left to be recovered
     tag_wait_s : how long lines wait for the tag that confirms them, once it is due, before they are flagged;
@@ -88,7 +88,7 @@ class CapturePlan:
     watch: WatchPlan | None = None
     disk: Disk = DISK
     patience_s: float | None = None
-    goes_on: bool = False
+    continues: bool = False
     seal_timeout_s: float = END_S
 
     def __post_init__(self) -> None:

@@ -491,7 +491,7 @@ class Recorder:
         rows = {name: book.next_line - session.first_line for name, book in session.books.items()}
         counters["recorded"], counters["committed"] = min(rows.values()), session.writer.committed_lines
         counters["beyond_bytes"] = session.writer.beyond_bytes
-        counters["draining"] = session.ending and not (self._cut_short and self._plan.goes_on)
+        counters["draining"] = session.ending and not (self._cut_short and self._plan.continues)
         for name, book in session.books.items():
             counters[f"rows_{name}"] = rows[name]
             counters[f"missing_{name}"] = book.missing.total()

@@ -43,4 +43,4 @@ class RecorderPlan:
     max_skew_lines: int
     realtime: bool = False
     disk: Disk = DISK
-    goes_on: bool = False
+    continues: bool = False

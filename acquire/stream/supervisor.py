@@ -61,7 +61,7 @@ class Supervisor:
         succession: Succession | None = None,
     ) -> None:
         self.fault: str | None = None
-        self.life = Lifecycle(goes_on=plan.goes_on)
+        self.life = Lifecycle(continues=plan.continues)
         self._workers = workers
         self._succession = succession or Succession({})
         self._feed = TagFeed(trigger, tags, counters[TRIGGER], report=self.report, fail=self._fail)

@@ -84,7 +84,7 @@ def check_books(capture: Capture, *paths: Path) -> None:
 def test_a_pause_is_waited_out_as_long_as_the_rings_hold(tmp_path: Path, at: str, fsync: str) -> None:
     """And another one right after it; no line is lost, flagged or in doubt."""
     disk = PausingDisk(tmp_path / "gate", at)
-    with recording(tmp_path / "r.zarr", disk, fsync=fsync, goes_on=True) as capture:
+    with recording(tmp_path / "r.zarr", disk, fsync=fsync, continues=True) as capture:
         for _ in range(2):
             disk.gate.touch()
             until(lambda: re.match(WORDS, capture.poll().waiting), "words")
@@ -101,7 +101,7 @@ def test_a_pause_is_waited_out_as_long_as_the_rings_hold(tmp_path: Path, at: str
 def test_after_a_longer_pause_the_recording_goes_on_in_a_further_segment(tmp_path: Path, how: str) -> None:
     path = tmp_path / "r.zarr"
     disk = PausingDisk(tmp_path / "gate", how)
-    with recording(path, disk, ring_slots=SHORT_RING, goes_on=True) as capture:
+    with recording(path, disk, ring_slots=SHORT_RING, continues=True) as capture:
         recorder = capture.pids["recorder"]
         assert recorder is not None
         if how == "SIGSTOP":
@@ -159,7 +159,7 @@ def test_a_recording_whose_end_passes_during_the_pause_has_ended(tmp_path: Path)
     """No further segment can begin: it says so, and does not wait for one."""
     path, lines = tmp_path / "r.zarr", (SHORT_RING + 100) * 64
     disk = PausingDisk(tmp_path / "gate", "pages")
-    with recording(path, disk, lines, ring_slots=SHORT_RING, goes_on=True) as capture:
+    with recording(path, disk, lines, ring_slots=SHORT_RING, continues=True) as capture:
         disk.gate.touch()
         until(lambda: overflow(capture), "full rings")
         end_line = (capture.poll().first_line or 0) + lines
@@ -194,7 +194,7 @@ def test_a_recording_that_must_not_go_on_ends_there(tmp_path: Path) -> None:
 
 def test_a_stop_during_a_pause_ends_where_it_was_asked_for(tmp_path: Path) -> None:
     disk = PausingDisk(tmp_path / "gate", "pages")
-    with recording(tmp_path / "r.zarr", disk, goes_on=True) as capture:
+    with recording(tmp_path / "r.zarr", disk, continues=True) as capture:
         disk.gate.touch()
         until(disk.held.exists, "a write that is held up")
         before = capture.poll().lines["a"]["delivered"]
@@ -212,7 +212,7 @@ def test_a_stop_during_a_pause_ends_where_it_was_asked_for(tmp_path: Path) -> No
 def test_a_budget_that_ends_during_the_pause_is_kept(tmp_path: Path) -> None:
     """The rings hold the last line, and what comes after it is not wanted."""
     disk = PausingDisk(tmp_path / "gate", "commit")
-    with recording(tmp_path / "r.zarr", disk, 12_000, goes_on=True) as capture:
+    with recording(tmp_path / "r.zarr", disk, 12_000, continues=True) as capture:
         disk.gate.touch()
         until(lambda: capture.poll().lines["b"]["delivered"] > 40_000, "the last line and more")
         disk.gate.unlink()
@@ -225,7 +225,7 @@ def test_a_budget_that_ends_during_the_pause_is_kept(tmp_path: Path) -> None:
 @pytest.mark.parametrize("at", ["make", "seal"])
 def test_a_pause_while_a_recording_is_created_or_sealed_costs_nothing(tmp_path: Path, at: str) -> None:
     disk = PausingDisk(tmp_path / "gate", at)
-    with capturing(disk, LOAD, goes_on=True) as capture:
+    with capturing(disk, LOAD, continues=True) as capture:
         disk.gate.touch()
         if at == "make":
             threading.Timer(1.5, disk.gate.unlink).start()
@@ -244,7 +244,7 @@ def test_a_recording_that_the_disk_does_not_create_is_refused_and_leaves_nothing
 ) -> None:
     monkeypatch.setattr("acquire.stream.supervisor._ANSWER_S", 0.5)
     disk = PausingDisk(tmp_path / "gate", "make")
-    with capturing(disk, LOAD, goes_on=True) as capture:
+    with capturing(disk, LOAD, continues=True) as capture:
         spec = recording_spec(LOAD, capture.clock)
         disk.gate.touch()
         with pytest.raises(DeviceError, match=r"it waits for the disk.*nothing was recorded"):
@@ -270,7 +270,7 @@ def can_start(capture: Capture, path: Path, spec: RecordingSpec) -> bool:
 def test_what_is_closed_during_a_pause_can_be_recovered(tmp_path: Path) -> None:
     """The devices are released in bounded time; what was acknowledged is there."""
     disk = PausingDisk(tmp_path / "gate", "pages")
-    with recording(tmp_path / "r.zarr", disk, goes_on=True) as capture:
+    with recording(tmp_path / "r.zarr", disk, continues=True) as capture:
         disk.gate.touch()
         until(disk.held.exists, "a write that is held up")
         acknowledged = capture.poll().committed_lines
@@ -286,7 +286,7 @@ def test_what_is_closed_during_a_pause_can_be_recovered(tmp_path: Path) -> None:
 def test_a_recorder_that_is_killed_during_a_pause_is_replaced_and_no_line_is_lost(tmp_path: Path) -> None:
     """Its successor finds a disk that does not answer either, and waits like it."""
     disk = PausingDisk(tmp_path / "gate", "pages")
-    with recording(tmp_path / "r.zarr", disk, goes_on=True) as capture:
+    with recording(tmp_path / "r.zarr", disk, continues=True) as capture:
         disk.gate.touch()
         until(disk.held.exists, "a write that is held up")
         recorder = capture.pids["recorder"]

@@ -93,7 +93,7 @@ class Bench:
 
     def __init__(self, directory: Path, stage: Stage = Stage.NONE, lines: int | None = None) -> None:
         self.directory, self.lines = directory, lines
-        self.life = Lifecycle(goes_on=True)
+        self.life = Lifecycle(continues=True)
         for event in WAYS[stage]:
             self.happen(event)
         assert self.life.stage is stage

@@ -118,7 +118,7 @@ def test_a_slow_disk_ends_the_recording_before_a_line_is_lost(
 
 
 def test_what_is_closed_between_two_segments_is_sealed_already(tmp_path: Path) -> None:
-    with capturing(SlowDisk(0.2 * LOAD.bytes_per_s), goes_on=True) as capture:
+    with capturing(SlowDisk(0.2 * LOAD.bytes_per_s), continues=True) as capture:
         capture.start(Begin(tmp_path / "r.zarr", recording_spec(LOAD, capture.clock)))
         life = capture._supervisor.life
 
