@@ -20,7 +20,7 @@ import contextlib
 import copy
 from dataclasses import asdict, dataclass, field, replace
 from itertools import product
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -146,6 +146,18 @@ def recover(
     return replace(done, changed=done.changed or lost, root_rebuilt=lost, not_listed=not_listed)
 
 
+class FoundGap(NamedTuple):
+    """Lost lines of an arm that no table lists yet."""
+
+    first_line: int
+    lines: int
+    cause: str
+
+    @property
+    def end_line(self) -> int:
+        return self.first_line + self.lines
+
+
 class _Recoverer:
     """One recovery, with the recording locked."""
 
@@ -218,7 +230,7 @@ class _Recoverer:
             tables_lost=self.tables_lost,
         )
 
-    def _salvage_tables(self, new_gaps: dict[str, list[tuple[int, int, str]]]) -> None:
+    def _salvage_tables(self, new_gaps: dict[str, list[FoundGap]]) -> None:
         """Take from the tables that cannot be read what is whole, and note what is lost."""
         if "events" in self.recording.unreadable:
             self.events, wrong = self.recording.salvaged_events()
@@ -232,14 +244,14 @@ class _Recoverer:
                 lost += ", and so are the gaps among the lines that retention had dropped"
             self.tables_lost["gaps"] += lost
 
-    def _flag(self, found: ArmScan) -> list[tuple[int, int, str]]:
-        """Flag the lost rows of one arm; return the gaps to be listed: first line, count, cause."""
+    def _flag(self, found: ArmScan) -> list[FoundGap]:
+        """Flag the lost rows of one arm; return the gaps to be listed."""
         size, reader = self.tag_rows, found.stream.reader("flags")
         listed: list[range] = []
         if not self.gaps_lost:
             lost_rows = self.recording.lost_rows(found.stream.arm, self.rows)
             listed = sorted(lost_rows, key=lambda rows: rows.start)
-        gaps: dict[str, list[tuple[int, int, str]]] = {"damaged": [], "unlisted": []}
+        gaps: dict[str, list[FoundGap]] = {"damaged": [], "unlisted": []}
         for chunk in chunks_of(size, [*self.kept, range(self.recording.lines, self.rows)]):
             here = range(chunk * size, min(self.rows, (chunk + 1) * size))
             lost = found.lost(range(here.start, here.start + size))  # a whole chunk, as it is rewritten
@@ -251,15 +263,15 @@ class _Recoverer:
                 self.flags_changed += 1
             missing, lost = missing_rows(flags)[: len(here)] & ~covered(listed, here), lost[: len(here)]
             for cause, rows in (("damaged", missing & lost), ("unlisted", missing & ~lost)):
+                known = gaps[cause]
                 for first, count in runs(rows, self.recording.first_line + here.start):
-                    begin, known = first, gaps[cause]
                     # A gap that reaches the end of a chunk continues in the next one.
-                    if known and known[-1][0] + known[-1][1] == first:
-                        begin = known.pop()[0]
-                    known.append((begin, first + count - begin, cause))
+                    joins = bool(known) and known[-1].end_line == first
+                    begin = known.pop().first_line if joins else first
+                    known.append(FoundGap(begin, first + count - begin, cause))
         return sorted(gap for of_cause in gaps.values() for gap in of_cause)
 
-    def _publish(self, new_gaps: dict[str, list[tuple[int, int, str]]]) -> None:
+    def _publish(self, new_gaps: dict[str, list[FoundGap]]) -> None:
         hidden = self.path / ARMS[0] / "lines"
         publisher = Publisher(hidden / SCRATCH, self.disk)
         document = copy.deepcopy(self.recording.document)
@@ -293,7 +305,7 @@ class _Recoverer:
         self.disk.sync_directory(self.path.parent)
 
     def _tables(
-        self, publisher: Publisher, new_gaps: dict[str, list[tuple[int, int, str]]]
+        self, publisher: Publisher, new_gaps: dict[str, list[FoundGap]]
     ) -> dict[str, layout.Document]:
         """Write gaps and events as they were, with the new ones; return their metadata."""
         recording = self.recording
@@ -334,11 +346,11 @@ class _Recoverer:
                 return int(self.recording.arms[arm].reader("tick").chunk(chunk)[row])
         return 0
 
-    def _attributes(self, new_gaps: dict[str, list[tuple[int, int, str]]]) -> dict[str, Any]:
+    def _attributes(self, new_gaps: dict[str, list[FoundGap]]) -> dict[str, Any]:
         attributes = dict(self.recording.attrs)
         if self.tables_lost:
             attributes["tables_lost"] = {**self.recording.tables_lost, **self.tables_lost}
-        lost = {arm: sum(count for _, count, _ in found) for arm, found in new_gaps.items()}
+        lost = {arm: sum(gap.lines for gap in found) for arm, found in new_gaps.items()}
         if self.sealed:
             attributes["ledger"] = ledger = copy.deepcopy(attributes["ledger"])
             for arm, book in ledger.items():
@@ -368,7 +380,7 @@ class _Recoverer:
             "ledger": {"pulses": self.rows, **arms, "store": store},
         }
 
-    def _book(self, arm: str, new_gaps: list[tuple[int, int, str]]) -> dict[str, Any]:
+    def _book(self, arm: str, new_gaps: list[FoundGap]) -> dict[str, Any]:
         """Return an arm's ledger, lines = stored + missing by cause, from the listed gaps."""
         missing: dict[str, int] = {}
         end = self.recording.first_line + self.rows
