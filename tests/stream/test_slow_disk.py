@@ -118,8 +118,9 @@ def test_a_slow_disk_ends_the_recording_before_a_line_is_lost(
 
 
 def test_what_is_closed_between_two_segments_is_sealed_already(tmp_path: Path) -> None:
-    with capturing(SlowDisk(0.2 * LOAD.bytes_per_s), continues=True) as capture:
-        capture.start(Begin(tmp_path / "r.zarr", recording_spec(LOAD, capture.clock)))
+    load = replace(LOAD, ring_slots=LOAD.ring_slots // 4)  # it is emptied before a pause begins
+    with capturing(SlowDisk(0.2 * load.bytes_per_s), load, continues=True) as capture:
+        capture.start(Begin(tmp_path / "r.zarr", recording_spec(load, capture.clock)))
         life = capture._supervisor.life
 
         def pauses() -> bool:
