@@ -111,25 +111,27 @@ class Recorder:
         self._counters = counters
         self._disk = disk
         self._external = external
+        # One recording at a time of each: created, written, sealed.
         self._state = RecorderState.WAITING
-        self._tagger: Tagger | None = None
         self._opening: Opening | None = None
         self._session: Session | None = None
         self._closing: tuple[Session, Future[Sealed]] | None = None
-        self._notes = Notes()
+        self._tagger: Tagger | None = None
         self._line_rate_hz = 0.0
-        self._trouble: tuple[str, dict[str, Cause]] | None = None
-        self._owner, self._busy = True, False
-        self._commit_s = 0.0
-        self._waits = DiskWaits(counters)
+        self._notes = Notes()
+        self._disk_waits = DiskWaits(counters)
         self._hold_ups = HoldUps()
-        self._cut_short, self._waited_in_vain_for = False, -1
+        self._waited_in_vain_for = -1  # the tags' end at which the latest block waited too long
+        self._interruption: tuple[str, dict[str, Cause]] | None = None
+        self._cut_short = False  # by a disk that was too slow: a further segment may follow
+        self._next_commit_s = 0.0
+        self._has_owner, self._busy = True, False
         shape = rings[ARMS[0]].shape
         self._blank = np.zeros((shape.rows, shape.width), shape.dtype)
-        self._waiting = select.poll()
+        self._doorbells = select.poll()
         sources: list[Mailbox | Ring] = [mailbox, tags, *rings.values()]
         for source in sources:
-            self._waiting.register(source, select.POLLIN | select.POLLHUP)
+            self._doorbells.register(source, select.POLLIN | select.POLLHUP)
 
     def turn(self) -> bool:
         """Do one round over messages, disk, tags and rings; return False once there is nothing left to do."""
@@ -151,13 +153,13 @@ class Recorder:
             if self._session is None:
                 raise
             self._close(self._session, error)
-        return self._owner or self._state in BUSY
+        return self._has_owner or self._state in BUSY
 
     def wait(self) -> None:
         """Wait until something may have come, for `_WAIT_S` at most; not at all while there is work."""
         if self._busy:
             return
-        self._waiting.poll(_WAIT_S * 1000)
+        self._doorbells.poll(_WAIT_S * 1000)
         # Before the next turn takes the blocks: a bell that is rung from now on ends the next wait.
         for ring in (self._tags, *(arm.ring for arm in self._arms.values())):
             ring.hush()
@@ -166,13 +168,13 @@ class Recorder:
 
     def _read_messages(self) -> None:
         try:
-            while self._owner and (message := self._mailbox.take()) is not None:
+            while self._has_owner and (message := self._mailbox.take()) is not None:
                 event = _CROSSING.get(type(message))
                 if event is None or (self._state, event) in TABLE:
                     self._handle(message)
         except OwnerGone as gone:
-            self._owner = False
-            self._waiting.unregister(self._mailbox)
+            self._has_owner = False
+            self._doorbells.unregister(self._mailbox)
             self._interrupt(str(gone), dict.fromkeys(ARMS, Cause.INTERRUPTED))
 
     def _handle(self, message: object) -> None:
@@ -220,7 +222,7 @@ class Recorder:
             return
         # On a busy disk, directories, locks and reserved space can take seconds, during which the rings must
         # be emptied.
-        writer = self._disk.submit(self._waits.elsewhere, prepare, begin, self._plan.disk)
+        writer = self._disk.submit(self._disk_waits.elsewhere, prepare, begin, self._plan.disk)
         self._opening = Opening(begin, lines, writer)
         self._go(RecorderEvent.BEGIN)
 
@@ -238,9 +240,9 @@ class Recorder:
             self._session.note(note.kind, note.line, note.text)
 
     def _interrupt(self, reason: str, lost: dict[str, Cause]) -> None:
-        """End the recording early. The trouble also ends one that is still being created."""
-        before = self._trouble[1] if self._trouble else {}
-        self._trouble = reason, lost | before  # the first cause of an arm's loss stays
+        """End the recording early, also one that is still being created."""
+        before = self._interruption[1] if self._interruption else {}
+        self._interruption = reason, lost | before  # the first cause of an arm's loss stays
         if self._session is not None:
             self._session.lost = lost | self._session.lost
             self._session.end(self._common_line(), reason, RunCondition.INTERRUPTED)
@@ -300,7 +302,7 @@ class Recorder:
             first_line = max(self._newest_line(), dropped_end)
         try:
             writer = opening.writer.result()
-            with self._waits.loop():
+            with self._disk_waits.loop():
                 if self._state is RecorderState.CANCELLED or opening.is_over(first_line):
                     writer.abandon()
                     past = f"line {first_line} is past the recording's end"
@@ -323,8 +325,8 @@ class Recorder:
         self._publish(self._session)
         end_line = self._session.end_line
         self._mailbox.post(Began(first_line, None if end_line == OPEN_END else end_line, writer.mount))
-        if self._trouble is not None:
-            self._interrupt(*self._trouble)
+        if self._interruption is not None:
+            self._interrupt(*self._interruption)
 
     def _refuse(self, error: AcquireError) -> None:
         if self._state is not RecorderState.CANCELLED:  # then nobody waits for the answer
@@ -359,7 +361,7 @@ class Recorder:
         self._session = None
         self._go(RecorderEvent.LAST_LINE)
         self._publish(session)
-        self._closing = session, self._disk.submit(self._waits.elsewhere, session.close, error)
+        self._closing = session, self._disk.submit(self._disk_waits.elsewhere, session.close, error)
 
     # ---- tags and lines
 
@@ -412,7 +414,7 @@ class Recorder:
             if loss.cause is Cause.RING_FULL and first < end:
                 self._counters.add(f"overrun_{name}", end - first)
                 self._counters[f"overrun_to_{name}"] = end
-        with self._waits.loop():
+        with self._disk_waits.loop():
             written = session.take(name, block, hurry=arm.ring.fill > _CALM_BLOCKS)
         if written:
             end_line = session.books[name].next_line
@@ -433,7 +435,7 @@ class Recorder:
             return
         try:
             if self._session is not None:
-                with self._waits.loop():
+                with self._disk_waits.loop():
                     self._session.writer.give_back(name)
         finally:
             self._count(name, lent.start, lent.stop)
@@ -457,7 +459,7 @@ class Recorder:
         if waited_s > self._plan.tag_wait_s or is_pressing:
             self._waited_in_vain_for = self._tagger.confirmed_end
         overdue = self._waited_in_vain_for == self._tagger.confirmed_end
-        return overdue or not self._owner
+        return overdue or not self._has_owner
 
     # ---- the current recording
 
@@ -478,11 +480,11 @@ class Recorder:
             session.lost.update(dict.fromkeys(stall.arms, Cause.STALLED))
             session.end(self._common_line(), stall.reason, stall.condition)
         begun = time.monotonic()
-        if begun >= self._commit_s:
-            with self._waits.loop():
+        if begun >= self._next_commit_s:
+            with self._disk_waits.loop():
                 session.commit()
             ended = time.monotonic()
-            self._commit_s = ended + max(_COMMIT_INTERVAL_S, (_COMMIT_SHARE - 1) * (ended - begun))
+            self._next_commit_s = ended + max(_COMMIT_INTERVAL_S, (_COMMIT_SHARE - 1) * (ended - begun))
         # After the commit: the lines published as committed must survive a kill.
         self._publish(session)
 
