@@ -26,7 +26,7 @@ def without(known: Calibration, steps: Iterable[str], place: str) -> Calibration
     asked = set(steps)
     if absent := sorted(asked - set(known.steps)):
         raise UsageError(f"{place} has no step {absent[0]!r}", possible=", ".join(known.steps) or "none")
-    going, why = _with_dependents(known, asked)
+    going, why = with_dependents(known, asked)
     if len(going) == len(known.steps):
         text = "; ".join(why) or "a calibration without a step cannot be written"
         raise UsageError(
@@ -56,9 +56,9 @@ def without(known: Calibration, steps: Iterable[str], place: str) -> Calibration
     )
 
 
-def _with_dependents(known: Calibration, asked: set[str]) -> tuple[set[str], list[str]]:
+def with_dependents(known: Calibration, asked: Iterable[str]) -> tuple[set[str], list[str]]:
     """Return the steps and all that depend on them, and a reason for each of these."""
-    going, reasons = set(asked), []
+    going, reasons = set(asked), list[str]()
     links = _links(known)
     while more := [(step, why) for base, step, why in links if base in going and step not in going]:
         for step, why in dict(more).items():

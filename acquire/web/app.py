@@ -18,9 +18,10 @@ from acquire.daemon.answers import Answers
 from acquire.daemon.control import new_app
 from acquire.daemon.messages import ErrorMessage, on_the_wire
 from acquire.daemon.routes import NO_STORE, RequestId, routes
+from acquire.daemon.who import WHO
 from acquire.errors import AcquireError, BusyError, UsageError
 from acquire.web.archive import Archive
-from acquire.web.calibrations import calibration_facts, place_of, rows_of
+from acquire.web.calibrations import calibration_facts, forget, place_of, rows_of
 from acquire.web.checkup import Checkup
 from acquire.web.guard import Guard
 from acquire.web.hub import Hub
@@ -30,6 +31,7 @@ from acquire.web.messages import (
     CalibrationFacts,
     CalibrationRequest,
     CheckupFacts,
+    ForgetRequest,
     HoldRequest,
     JobFacts,
     JobRequest,
@@ -287,11 +289,14 @@ def _add_checkup(api: APIRouter, checkup: Checkup, answers: Answers) -> None:
 def _add_calibration(
     api: APIRouter, hub: Hub, jobs: Jobs, directory: Path, reading: DiskReads, answers: Answers
 ) -> None:
-    @api.get("/calibration", summary="The calibration: its steps and their findings")
-    async def calibration() -> CalibrationFacts:
+    async def facts() -> CalibrationFacts:
         place, named = place_of(directory, hub.setup)
         rows = rows_of(hub.setup)
         return await reading(lambda: calibration_facts(place, named=named, rows=rows))
+
+    @api.get("/calibration", summary="The calibration: its steps and their findings")
+    async def calibration() -> CalibrationFacts:
+        return await facts()
 
     @api.post("/calibration", summary="Carry out a calibration step, as a job")
     async def calibrate(asked: CalibrationRequest, request_id: RequestId = None) -> JobFacts:
@@ -299,3 +304,15 @@ def _add_calibration(
             return jobs.calibrate(asked, place_of(directory, hub.setup)[0])
 
         return await answers.once(request_id, f"calibrate {asked}", work)
+
+    @api.post("/calibration/forget", summary="Take steps out of the calibration")
+    async def forget_steps(asked: ForgetRequest, request_id: RequestId = None) -> CalibrationFacts:
+        async def work() -> CalibrationFacts:
+            # It may just be measured with what would be forgotten.
+            jobs.refuse_while_calibrating()
+            place = place_of(directory, hub.setup)[0]
+            await reading(lambda: forget(place, asked))
+            log.info("%s forgotten from %s by %s", ", ".join(asked.steps), place, WHO.get())
+            return await facts()
+
+        return await answers.once(request_id, f"forget {asked}", work)

@@ -8,7 +8,13 @@ from typing import TYPE_CHECKING
 from acquire.calibrate.guide import BLACK, STEPS, TARGET, Step, lines_of
 from acquire.errors import AcquireError, DataError, NoDaemonError, PlaceError, UsageError
 from acquire.text import cause_in_words, shortened
-from acquire.web.messages import CalibrationFacts, CalibrationRequest, FindingFacts, StepFacts
+from acquire.web.messages import (
+    CalibrationFacts,
+    CalibrationRequest,
+    FindingFacts,
+    ForgetRequest,
+    StepFacts,
+)
 
 if TYPE_CHECKING:
     from acquire.calibrate import Calibration
@@ -59,6 +65,17 @@ def calibration_facts(place: Path, *, named: bool, rows: int) -> CalibrationFact
     return CalibrationFacts(path=str(place), named=named, error=error, steps=steps)
 
 
+def forget(place: Path, request: ForgetRequest) -> None:
+    """Take steps out of the calibration. Blocks on the disk.
+
+    Raises UsageError for a step that was not done or that others need, and if none would be left.
+    """
+    from acquire.calibrate.file import change_calibration
+    from acquire.calibrate.forget import without
+
+    change_calibration(place, lambda known: without(known, request.steps, str(place)))
+
+
 def step_of(request: CalibrationRequest) -> Step:
     """Return the step that a request names.
 
@@ -99,9 +116,11 @@ def _step(step: Step, known: Calibration | None, rows: int) -> StepFacts:
 
 
 def _finding(known: Calibration, name: str) -> FindingFacts:
+    from acquire.calibrate.forget import with_dependents
     from acquire.calibrate.words import found_facts
 
     try:
+        going, why = with_dependents(known, {name})
         finding = known.finding(name)
         facts = {key: str(text) for key, text in found_facts(finding).items() if text is not None}
         return FindingFacts(
@@ -110,6 +129,8 @@ def _finding(known: Calibration, name: str) -> FindingFacts:
             facts={key: text for key, text in facts.items() if key != "step"},
             lines=int(finding.facts.get("lines", 0)),
             warnings=list(finding.warnings),
+            also=[each for each in known.steps if each in going and each != name],
+            why=why,
         )
     except (LookupError, TypeError, ValueError) as error:
         raise DataError(

@@ -100,10 +100,7 @@ class Jobs:
         Raises UsageError if there is no such step, StateError while another step is running.
         """
         step = step_of(request)
-        if any(job.facts.state == "running" for job in self._jobs.values() if job.facts.kind == "calibrate"):
-            raise StateError(
-                "a calibration step is already running", hint="wait until it is done, or stop it"
-            )
+        self.refuse_while_calibrating()
         facts = JobFacts(
             id=self._next(), kind="calibrate", step=step.name, lines=request.lines, state="running"
         )
@@ -111,6 +108,13 @@ class Jobs:
         self._keep(job)
         self._step = asyncio.create_task(self._try(job))
         return facts
+
+    def refuse_while_calibrating(self) -> None:
+        """Raise StateError while a calibration step is running."""
+        if any(job.facts.state == "running" for job in self._jobs.values() if job.facts.kind == "calibrate"):
+            raise StateError(
+                "a calibration step is already running", hint="wait until it is done, or stop it"
+            )
 
     def _next(self) -> int:
         self._count += 1

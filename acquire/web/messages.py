@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from datetime import datetime
-from typing import Literal
+from typing import Annotated, Literal
 
 from pydantic import Field
 
@@ -136,6 +136,12 @@ class CalibrationRequest(Message):
     )
 
 
+class ForgetRequest(Message):
+    """Findings to take out of the calibration, those that depend on them included."""
+
+    steps: list[Annotated[str, Field(max_length=64)]] = Field(min_length=1, max_length=64)
+
+
 class JobFacts(Message):
     """A job and its result."""
 
@@ -177,6 +183,8 @@ class FindingFacts(Message):
     lines: int
     facts: dict[str, Text] = Field(description="quantity → value and uncertainty")
     warnings: list[Text]
+    also: list[Text] = Field(default=[], description="steps that can only be forgotten together with it")
+    why: list[Text] = Field(default=[], description="why each of these depends on it")
 
 
 class StepFacts(Message):

@@ -1,7 +1,7 @@
 // The steps of a calibration, each with its preparation, a button, and its findings with their uncertainties.
 
 import { ask } from "./link.js";
-import { $, count, day, fill, make } from "./words.js";
+import { $, count, counted, day, fill, make } from "./words.js";
 
 const REFRESH_MS = 1000;
 const TITLES = { delay: "Delay", dark: "Dark", linearity: "Linearity", flat: "Flat", target: "Target", psf: "Blur", veil: "Veil" };
@@ -55,7 +55,7 @@ export class Calibrate {
     $("calibration-place").textContent = facts.error ?? `${facts.path}. ${facts.named ? "The rig names it: every recording gets a copy." : `Recordings will get a copy once the rig file sets calibration = "${facts.path}".`}`;
     $("calibration-place").className = facts.error ? "bad" : "hint";
     if (!this.#cards.size) {
-      for (const step of facts.steps) this.#cards.set(step.name, new Card(step, (asked) => this.#begin(step.name, asked), () => this.#cancel()));
+      for (const step of facts.steps) this.#cards.set(step.name, new Card(step, (asked) => this.#begin(step.name, asked), () => this.#cancel(), (finding) => this.#ask(step.name, finding)));
       $("steps").replaceChildren(...[...this.#cards.values()].map((card) => card.element));
     }
     for (const step of facts.steps) this.#cards.get(step.name).found(step.found);
@@ -65,6 +65,23 @@ export class Calibrate {
   async #begin(step, asked) {
     this.#fail("");
     try { this.#job = await ask("POST", "calibration", { step, ...asked }); this.#showJob(); await this.#follow(); }
+    catch (error) { this.#fail(error.message); }
+  }
+
+  /** Ask whether a finding is to be forgotten, with all that depend on it. */
+  #ask(step, finding) {
+    const steps = [finding.name, ...finding.also], dialog = $("forget");
+    $("forget-title").textContent = `Forget ${steps.join(", ")}?`;
+    $("forget-text").textContent = `Reconstructions will no longer correct ${steps.length > 1 ? "them" : "it"}. Recordings keep the copies that they carry.${finding.also.length ? ` ${counted(finding.also.length, "other step")} must go as well:` : ""}`;
+    $("forget-why").replaceChildren(...finding.why.map((why) => make("li", {}, why)));
+    dialog.returnValue = "";
+    dialog.onclose = () => { if (dialog.returnValue === "forget") this.#forget(step, steps); };
+    dialog.showModal();
+  }
+
+  async #forget(step, steps) {
+    this.#fail("");
+    try { this.#build(await ask("POST", "calibration/forget", { steps })); this.#showJob(); $(`begin-${step}`).focus(); }
     catch (error) { this.#fail(error.message); }
   }
 
@@ -89,14 +106,18 @@ export class Calibrate {
     return before && !before.found.length ? `The step ${TITLES[step.after]} must be done first.` : "";
   }
 
-  #enable() { for (const step of this.#steps) this.#cards.get(step.name).enable(this.#why(step), this.#operator); }
+  #enable() {
+    const free = this.#operator && !this.#unknown && this.#job?.state !== "running";
+    for (const step of this.#steps) this.#cards.get(step.name).enable(this.#why(step), this.#operator, free);
+  }
 }
 
 class Card {
   #state = make("span"); #text = make("p", { role: "status" }); #bar = make("progress", { hidden: true }); #found = make("div");
-  #lines; #black = make("input", { type: "checkbox" }); #begin; #cancel; #why = make("p", { className: "hint" }); #running = false;
+  #lines; #black = make("input", { type: "checkbox" }); #begin; #cancel; #why = make("p", { className: "hint" }); #running = false; #done = false; #free = false; #forget;
 
-  constructor(step, begin, cancel) {
+  constructor(step, begin, cancel, forget) {
+    this.#forget = forget;
     const title = TITLES[step.name] ?? step.name;
     this.#lines = make("input", { type: "number", id: `lines-${step.name}`, min: step.least_lines, max: 2 ** 20, value: step.lines ?? "", placeholder: step.lines ? String(step.lines) : "automatic", className: "long", inputMode: "numeric" });
     this.#begin = make("button", { className: "primary", id: `begin-${step.name}`, onclick: () => this.#ask(begin) }, `Measure ${title.toLowerCase()}`);
@@ -114,7 +135,10 @@ class Card {
     begin({ ...(this.#lines.value === "" ? {} : { lines: Number(this.#lines.value) }), ...(this.#black.checked ? { black: true } : {}) });
   }
 
-  enable(why, operator) {
+  /** `free`: findings may be forgotten now. */
+  enable(why, operator, free) {
+    this.#free = free;
+    for (const button of this.#found.querySelectorAll("button")) button.disabled = !free;
     this.#begin.disabled = Boolean(why) || this.#running;
     this.#cancel.disabled = !operator;
     if (this.#why.textContent !== why) this.#why.textContent = why;
@@ -130,17 +154,19 @@ class Card {
     if (handed && held) (running ? this.#cancel : this.#begin).focus();
     this.#bar.hidden = !running;
     if (running && job.total) { this.#bar.max = job.total; this.#bar.value = job.done; } else this.#bar.removeAttribute("value");
-    const text = { running: job?.text, failed: `Failed: ${job?.text}.`, stopped: `Cancelled: ${job?.text}.`, done: "Done." }[job?.state] ?? "";
+    const text = { running: job?.text, failed: `Failed: ${job?.text}.`, stopped: `Cancelled: ${job?.text}.`, done: this.#done ? "Done." : "" }[job?.state] ?? "";
     if (this.#text.textContent !== text) this.#text.textContent = text;
     this.#text.className = job?.state === "failed" ? "bad" : "";
   }
 
   found(found) {
     const latest = found.map((one) => one.made).sort().at(-1);
+    this.#done = Boolean(latest);
     this.#state.textContent = latest ? `✓ ${day(Date.parse(latest) * 1e6)}` : "not done yet";
     this.#state.className = latest ? "good" : "unknown";
     fill(this.#found, JSON.stringify(found), () => found.map((one) => make("div", {}, found.length > 1 ? make("h4", {}, one.name) : null,
       make("dl", {}, ...[["lines", count(one.lines)], ...Object.entries(one.facts)].flatMap(([what, text]) => [make("dt", {}, what), make("dd", {}, text)])),
-      ...one.warnings.map((text) => make("p", { className: "warning" }, `! ${text}`)))));
+      ...one.warnings.map((text) => make("p", { className: "warning" }, `! ${text}`)),
+      make("button", { disabled: !this.#free, onclick: () => this.#forget(one) }, `Forget ${one.name}…`))));
   }
 }
