@@ -24,7 +24,14 @@ from acquire.calibrate.guide import (
     Step,
     lines_of,
 )
-from acquire.cli.calibrate_live import instrument, print_finding, record, save_finding, wait_for_enter
+from acquire.cli.calibrate_live import (
+    instrument,
+    print_finding,
+    record,
+    recordings_kept,
+    save_finding,
+    wait_for_enter,
+)
 from acquire.cli.control import SocketOption
 from acquire.cli.output import JsonFlag, note, print_json, print_warning, say
 from acquire.cli.places import calibration_place
@@ -169,10 +176,12 @@ def calibrate_all(
 @contextmanager
 def _telling_what_is_left(steps: list[Step], number: int, out: str) -> Iterator[None]:
     """If a step fails or is interrupted, say which ones were saved before it, and how to continue."""
+    from acquire.store.source import source_of
+
     try:
         yield
     except BaseException:
-        if number:
+        if number and source_of(out).exists():
             done = ", ".join(step.name for step in steps[:number])
             left = "".join(f" --only {step.name}" for step in steps[number:])
             black = " --black" if any("veil" in step.tries for step in steps[number:]) else ""
@@ -228,9 +237,15 @@ def _step(
             exposure = record(daemon, step.name, directory, lines, out, code=step.code)
             found = []
             evaluations = _evaluations(exposure)
-            for name in _wanted(step, out):
+            with recordings_kept(out, [exposure], step.finds):
+                wanted = _wanted(step, out)
+            for number, name in enumerate(wanted):
                 # Saved one by one: the next evaluation of the same recording builds on this one.
-                found.append(save_finding(out, exposure, evaluations[name]))
+                found.append(
+                    save_finding(
+                        out, [exposure], evaluations[name], wanted[number:], first=not (step.after or number)
+                    )
+                )
                 if not quiet:
                     print_finding(found[-1])
                     say()
@@ -262,12 +277,12 @@ def _tried(
     A target need not show everything, and what it has shown is worth keeping.
     """
     try:
-        more = save_finding(out, exposure, evaluate)
+        more = save_finding(out, [exposure], evaluate, [name], first=False)
     except UsageError as error:
         text = f"{MISSING[name]}: {error.message}; {INSTEAD[name]}"
         # kept in the calibration, so that whoever reads it later knows what is missing, and why
         last = replace(found[-1], warnings=(*found[-1].warnings, text))
-        save_finding(out, exposure, lambda _: last)
+        save_finding(out, [exposure], lambda _: last, [name], first=False)
         print_warning(text)
         return [*found[:-1], last]
     if not quiet:
@@ -276,17 +291,17 @@ def _tried(
     return [*found, more]
 
 
-def _wanted(step: Step, out: str) -> Iterator[str]:
-    """Yield the steps that a recording must complete.
+def _wanted(step: Step, out: str) -> list[str]:
+    """Return the steps that a recording must complete.
 
     The transfer is left out if a ramp was recorded (step linearity), which determines it better than one
     flat.
     """
     from acquire.calibrate import open_calibration
 
-    for name in step.finds:
-        if name != "transfer" or "linearity" not in open_calibration(out).steps:
-            yield name
+    if "transfer" in step.finds and "linearity" in open_calibration(out).steps:
+        return [name for name in step.finds if name != "transfer"]
+    return list(step.finds)
 
 
 def _evaluations(exposure: Exposure) -> dict[str, Callable[[Calibration], Finding]]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -10,12 +9,12 @@ import typer
 
 from acquire.calibrate.guide import DELAY, MOST_LINES
 from acquire.cli.calibrate_live import (
-    instrument,
     print_finding,
     record,
+    recordings_kept,
     refuse_other,
     save_finding,
-    wait_for_enter,
+    series,
 )
 from acquire.cli.control import SocketOption
 from acquire.cli.output import JsonFlag, note, print_json
@@ -94,18 +93,10 @@ def _swept(
 ) -> tuple[list[Exposure], bool]:
     """Record the sweep until Ctrl-C; return its exposures, and whether the sweep is complete."""
     from acquire.calibrate import delay_sweep as sweep
-    from acquire.cli.interrupts import stop_on_interrupt
     from acquire.cli.progress import ProgressDisplay
     from acquire.daemon.messages import TriggerDelays
 
-    finishing = "ending with the recordings made so far"
-    with contextlib.ExitStack() as held:
-        # Before the scene is put in, and Enter pressed: this may refuse the rig.
-        daemon = held.enter_context(instrument(socket, directory, out))
-        note(f"delay: {DELAY.prepare}")
-        if ask:
-            wait_for_enter()
-        stop_requested = held.enter_context(stop_on_interrupt(finishing))
+    with series(socket, directory, out, f"delay: {DELAY.prepare}", ask=ask) as (daemon, stopped):
         # the first recording gives the rough delay, around which the sweep is laid
         first = record(daemon, "delay", directory, sweep.FIRST_LINES, out)
         setting, point = sweep.setting_of(first), sweep.point_of(first)
@@ -118,7 +109,7 @@ def _swept(
         with ProgressDisplay("sweeping the delays") as progress:
             for done, each in enumerate(settings):
                 progress.advance(done, len(settings))
-                if stop_requested.is_set():
+                if stopped.is_set():
                     break
                 delays = TriggerDelays(light_lead=each.light_lead_ticks, a=each.a_ticks, b=each.b_ticks)
                 exposures.append(record(daemon, "delay", directory, lines, out, delays=delays))
@@ -135,7 +126,8 @@ def _found(out: str, exposures: list[Exposure], *, whole: bool) -> Finding:
     with stage_progress("evaluating the sweep") as advance:
         found = evaluate(exposures, progress=advance)
     if not whole and source_of(out).exists():
-        known = open_calibration(out).quantities.get("light_late_ticks")
+        with recordings_kept(out, exposures, ["delay"]):
+            known = open_calibration(out).quantities.get("light_late_ticks")
         ticks = float(found.quantities["light_late_ticks"].uncertainty.max())
         # A sweep that Ctrl-C cut short must not spoil what a whole one has found.
         if known is not None and known.uncertainty.max() < ticks:
@@ -145,4 +137,4 @@ def _found(out: str, exposures: list[Exposure], *, whole: bool) -> Finding:
                 hint="the whole sweep; the earlier result is kept",
             )
     # Evaluated already, since its uncertainty decided whether it is saved.
-    return save_finding(out, exposures[0], lambda _: found)
+    return save_finding(out, exposures, lambda _: found, ["delay"])

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -10,12 +9,11 @@ import typer
 
 from acquire.calibrate.guide import LINEARITY, MOST_LINES, RAMP_LINES
 from acquire.cli.calibrate_live import (
-    instrument,
     print_finding,
     record,
     refuse_other,
     save_finding,
-    wait_for_enter,
+    series,
 )
 from acquire.cli.control import SocketOption
 from acquire.cli.output import JsonFlag, note, print_json, say
@@ -76,9 +74,16 @@ def linearity(
     else:
         exposures = _ramp(out, directory, lines, socket, ask=not yes)
     with stage_progress("evaluating the ramp") as advance:
-        curve = save_finding(out, exposures[0], lambda known: evaluate(exposures, known, progress=advance))
+        curve = save_finding(
+            out,
+            exposures,
+            lambda known: evaluate(exposures, known, progress=advance),
+            ["linearity"],
+            # It was there when the ramp was recorded: that it is gone is said, not that there is no dark.
+            first=bool(recordings),
+        )
     # Only now: it straightens the levels by the curve that has just been saved.
-    gain = save_finding(out, exposures[0], lambda known: transfer(exposures, known))
+    gain = save_finding(out, exposures, lambda known: transfer(exposures, known), ["linearity"], first=False)
     if json:
         steps = {}
         for found in (curve, gain):
@@ -100,20 +105,12 @@ def _ramp(out: str, directory: Path, lines: int, socket: Path | None, *, ask: bo
     from acquire.calibrate import open_calibration
     from acquire.calibrate.checks import offset_of
     from acquire.calibrate.linearity import PARTS, level_ticks, lit_ticks
-    from acquire.cli.interrupts import stop_on_interrupt
     from acquire.cli.progress import ProgressDisplay
     from acquire.daemon.messages import TriggerWindow
 
     # Before the recordings, not after: without a dark they could not be evaluated.
     offset = offset_of(open_calibration(out), "linearity")
-    finishing = "ending with the recordings made so far"
-    with contextlib.ExitStack() as held:
-        # Before the scene is put in, and Enter pressed: this may refuse the rig.
-        daemon = held.enter_context(instrument(socket, directory, out))
-        note(f"linearity: {LINEARITY.prepare}")
-        if ask:
-            wait_for_enter()
-        stop_requested = held.enter_context(stop_on_interrupt(finishing))
+    with series(socket, directory, out, f"linearity: {LINEARITY.prepare}", ask=ask) as (daemon, stopped):
         whole = record(daemon, "ramp", directory, lines, out, code="steady")
         ticks = lit_ticks(whole)[1]
 
@@ -132,7 +129,7 @@ def _ramp(out: str, directory: Path, lines: int, socket: Path | None, *, ask: bo
         with ProgressDisplay("recording the ramp") as progress:
             for done, lit in enumerate(levels):
                 progress.advance(done, len(levels))
-                if stop_requested.is_set():
+                if stopped.is_set():
                     break
                 exposures.append(level(lit))
     return exposures

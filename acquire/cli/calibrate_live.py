@@ -3,19 +3,22 @@
 from __future__ import annotations
 
 import os
+import shlex
 import sys
 import time
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
+from acquire.cli.interrupts import stop_on_interrupt
 from acquire.cli.output import note, print_facts, print_warning
 from acquire.daemon.states import State, refusal
 from acquire.daemon.who import LONGEST, WHO
-from acquire.errors import DataError, StateError, UsageError
+from acquire.errors import AcquireError, DataError, StateError, StoreError, UsageError
 from acquire.text import counted
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Iterator, Mapping
+    import threading
+    from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
     from pathlib import Path
 
     from acquire.calibrate.calibration import Calibration, Finding
@@ -67,6 +70,23 @@ def instrument(socket: Path | None, directory: Path, out: str) -> Iterator[Clien
             # The same run: the command ended before it armed anything, and there is nothing to restore.
             if _settled(daemon, calm_s).run_id != status.run_id:
                 _leave(daemon, directory, armed=status.state is State.ARMED)
+
+
+@contextmanager
+def series(
+    socket: Path | None, directory: Path, out: str, prepare: str, *, ask: bool
+) -> Iterator[tuple[Client, threading.Event]]:
+    """Connect as `instrument` does for a series of recordings, and return what Ctrl-C sets to end it early.
+
+    ``prepare`` says what to put in front of the lens; with ``ask``, Enter confirms that it is there.
+    """
+    # Before the scene is put in, and Enter pressed: this may refuse the rig.
+    with instrument(socket, directory, out) as daemon:
+        note(prepare)
+        if ask:
+            wait_for_enter()
+        with stop_on_interrupt("ending with the recordings made so far") as stop_requested:
+            yield daemon, stop_requested
 
 
 def record(
@@ -162,21 +182,53 @@ def _known_at(out: str) -> Calibration | None:
     return open_calibration(out) if source_of(out).exists() else None
 
 
-def save_finding(out: str, exposure: Exposure, evaluate: Callable[[Calibration], Finding]) -> Finding:
-    """Evaluate an exposure and add the result to the calibration at ``out``.
+def save_finding(
+    out: str,
+    exposures: Sequence[Exposure],
+    evaluate: Callable[[Calibration], Finding],
+    steps: Iterable[str],
+    *,
+    first: bool = True,
+) -> Finding:
+    """Evaluate exposures and add the result to the calibration at ``out``.
 
-    Raises UsageError if the exposure does not determine the orientation.
+    ``steps`` are those that the exposures are to complete, from this one on. ``first``: it may be the
+    calibration's first. Raises UsageError if the exposure does not determine the orientation, and what
+    `recordings_kept` raises if there is no place for the result any more.
     """
-    from acquire.calibrate import Calibration
+    from acquire.calibrate import Calibration, open_calibration
     from acquire.calibrate.file import change_calibration
 
-    begun = Calibration(exposure.instrument)
-    found = evaluate(_known_at(out) or begun)
+    begun = Calibration(exposures[0].instrument)
+    with recordings_kept(out, exposures, steps):
+        known = _known_at(out) or begun if first else open_calibration(out)
+    found = evaluate(known)
     if found.step == "orientation" and found.orientation is None:
         raise UsageError(f"orientation: {found.warnings[0]}")
-    # Of what is there now: another command may have added a step during the evaluation.
-    change_calibration(out, lambda now: now.with_step(found), new=begun)
+    with recordings_kept(out, exposures, steps):
+        # Of what is there now: another command may have added a step during the evaluation.
+        change_calibration(out, lambda now: now.with_step(found), new=begun if first else None)
     return found
+
+
+@contextmanager
+def recordings_kept(out: str, exposures: Sequence[Exposure], steps: Iterable[str]) -> Iterator[None]:
+    """If the calibration cannot be read or written any more, say how to evaluate the recordings later.
+
+    A UsageError becomes a StoreError: the place was usable before the recordings were made.
+    """
+    try:
+        yield
+    except AcquireError as error:
+        places = shlex.join(str(each.recording.path) for each in exposures)
+        later = " && ".join(f"acquire calibrate {step} {places} --out {shlex.quote(out)}" for step in steps)
+        kept = "the recording is" if len(exposures) == 1 else f"the {len(exposures)} recordings are"
+        kind = StoreError if isinstance(error, UsageError) else type(error)
+        raise kind(
+            f"{error.message}; {kept} kept",
+            possible=error.possible,
+            hint="; ".join(filter(None, (error.hint, f"then {later}"))),
+        ) from error
 
 
 def print_finding(found: Finding, more: Mapping[str, Any] | None = None) -> None:
