@@ -50,9 +50,10 @@ def transfer(
     """Measure DN per electron, read noise and, if the lines reach it, full well.
 
     K = (σ² − σ_d²) / (μ − μ_d) (EMVA 1288 Eq. 13), over the levels of ``exposures`` until pixels are full.
-    Variations common to all columns of a line are excluded, since they come from the light and not from the
-    sensor. Raises UsageError without a dark, for a light that is not steady, and for lines without shot
-    noise.
+    An earlier full well that these lines do not reach is kept; ``full_well_made`` of the facts says when it
+    was measured. Variations common to all columns of a line are excluded, since they come from the light and
+    not from the sensor. Raises UsageError without a dark, for a light that is not steady, and for lines
+    without shot noise.
     """
     dark_lines = int(known.steps.get("dark", {}).get("lines", 0))
     offset = offset_of(known, "transfer")
@@ -92,6 +93,10 @@ def transfer(
         "levels": len(exposures),
         "brightest_e": per_arm(np.array([max(p.light for p in points[arm]) for arm in ARMS]) / K),
     }
+    if "full_well_e" not in quantities and "full_well_e" in known.quantities:
+        # It stays in the calibration, and must not pass for a result of these lines.
+        before = known.steps.get("transfer", {})
+        facts["full_well_made"] = before.get("full_well_made", before.get("made"))
     return Finding("transfer", exposures[0].instrument, quantities, facts=facts)
 
 

@@ -12,7 +12,7 @@ from acquire.calibrate.calibration import Measured
 from acquire.text import counted
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Mapping, Sequence
 
     from acquire.calibrate.calibration import AlignmentFound, Calibration, Finding, TileAlignment
     from acquire.calibrate.check import Check
@@ -38,6 +38,8 @@ def found_facts(found: Finding) -> dict[str, Any]:
     """Describe a finding: name → value and uncertainty, in words."""
     facts: dict[str, Any] = {"step": f"{found.step}, {counted(found.facts.get('lines', 0), 'line')}"}
     facts |= _quantities(found.quantities)
+    if kept := _full_well_kept(found.facts):
+        facts["full well"] = "; ".join(filter(None, (facts.get("full well"), kept)))
     if found.step == "flat":
         facts["arm A's part of the light"] = f"{found.facts['part_a']:.2%}"
         facts["hidden by the optics"] = _columns(found.facts["optics_hide_columns"])
@@ -90,8 +92,9 @@ def known_facts(known: Calibration) -> dict[str, Any]:
     if "shading" in known.quantities and not belongs_to_flat(known):
         facts["the lens's light"] = "not used: measured with another flat; repeat acquire calibrate align"
     for name, step in known.steps.items():
+        more = [f"full well: {kept}"] if (kept := _full_well_kept(step)) else []
         facts[name] = f"{counted(step.get('lines', 0), 'line')}, {step['made']}" + "".join(
-            f"; {text}" for text in step.get("warnings", ())
+            f"; {text}" for text in (*more, *step.get("warnings", ()))
         )
     return facts
 
@@ -108,6 +111,12 @@ def compared_rows(found: Check) -> list[dict[str, str]]:
         }
         for each in found.compared
     ]
+
+
+def _full_well_kept(step: Mapping[str, Any]) -> str:
+    """Return which full well a repeated transfer has kept; empty if it has measured its own, or none."""
+    made = step.get("full_well_made")
+    return f"not reached by these lines, so that of {made} is kept" if made else ""
 
 
 def _quantities(quantities: Any) -> dict[str, str]:

@@ -11,6 +11,8 @@ import pytest
 from instruments import COLUMNS, NOISE, dots, record, white
 from PIL import Image
 
+from acquire.calibrate import open_calibration
+from acquire.calibrate.words import found_facts
 from acquire.store import open_video
 
 Cli = Callable[..., Any]
@@ -53,6 +55,31 @@ def test_step_by_step_to_a_page(cli: Cli, taken: dict[str, Path], tmp_path: Path
     answer = cli("calibrate", "check", cal, taken["target"])
     assert answer.code == 0, answer.err
     assert answer.out.count("holds") == 6
+
+
+def test_a_full_well_that_a_repeated_transfer_keeps_is_said(cli: Cli, tmp_path: Path) -> None:
+    """It passed for a result of the new lines: neither the answer nor `show` said of when it was."""
+    effects, cal = [*NOISE, {"kind": "full_well", "capacity_e": 20_000}], tmp_path / "cal.zarr"
+    levels = [record(tmp_path / f"{x}.zarr", white(x, effects), "flat") for x in (0.1, 0.2, 0.3, 0.37, 0.42)]
+    dark = record(tmp_path / "dark.zarr", white(effects=effects), "dark")
+    assert cli("calibrate", "dark", dark, "--out", cal).code == 0
+    first = cli("calibrate", "transfer", levels[1], "--out", cal)
+    assert "full well" not in first.out + cli("calibrate", "show", cal).out
+    whole = cli("calibrate", "transfer", *levels, "--out", cal)
+    assert "full well" in whole.out
+    assert "kept" not in whole.out + cli("calibrate", "show", cal).out
+    steps = open_calibration(cal).steps
+    made = steps["transfer"]["made"]
+    kept = f"not reached by these lines, so that of {made} is kept"
+    for _ in range(2):  # the date stays that of the lines that reached it
+        again = cli("calibrate", "transfer", levels[1], "--out", cal)
+        assert kept in " ".join(again.out.split()), again.out
+        assert kept in " ".join(cli("calibrate", "show", cal).out.split())
+    found = open_calibration(cal).finding("transfer")
+    assert found_facts(found)["full well"].startswith("a 19")
+    assert kept in found_facts(found)["full well"]
+    assert cli("calibrate", "transfer", *levels, "--out", cal).code == 0
+    assert kept not in " ".join(cli("calibrate", "show", cal).out.split())
 
 
 def test_a_step_is_forgotten(cli: Cli, taken: dict[str, Path], tmp_path: Path) -> None:
