@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import importlib
 import os
 import re
@@ -112,7 +113,45 @@ def command_of(modules: Iterable[str]) -> Any:
     command = typer.main.get_command(build(modules))
     make_plain(command)
     use_quick_coercion(command)
+    _refuse_second_values(command)
     return command
+
+
+def _refuse_second_values(command: Any) -> None:
+    """Refuse two different values of one option, of which click would silently take the last.
+
+    Repeatable options are left alone, and so are the same value given twice, environment variables and
+    defaults.
+    """
+    make_parser = command.make_parser
+
+    def make(context: Any) -> Any:
+        parser = make_parser(context)
+        # For completions, a command line is read as far as it goes.
+        if not context.resilient_parsing:
+            # The option objects of an unknown version of click are left alone.
+            names = {**getattr(parser, "_short_opt", {}), **getattr(parser, "_long_opt", {})}
+            for option in {id(each): each for each in names.values()}.values():
+                option.process = functools.partial(_process_once, option, option.process, context)
+        return parser
+
+    command.make_parser = make
+    for below in getattr(command, "commands", {}).values():
+        _refuse_second_values(below)
+
+
+def _process_once(option: Any, process: Any, context: Any, value: Any, state: Any) -> None:
+    if option.action == "store" and (before := state.opts.get(option.dest, value)) != value:
+        *others, name = sorted(option.obj.opts, key=len)
+        also = f" ({' or '.join(others)})" if others else ""
+        command = context.command_path
+        raise UsageError(
+            f"{command.removeprefix('acquire').lstrip()}: {name}{also} is given twice, as {before} and as "
+            f"{value}",
+            possible="one value",
+            hint=f"leave one of them out; or {command} --help",
+        )
+    process(value, state)
 
 
 def not_installed(error: ModuleNotFoundError) -> UsageError:
