@@ -128,6 +128,17 @@ def recording_facts(facts: dict[str, Any]) -> dict[str, Any]:
     }
 
 
+def what_to_try(place: object, damage: str) -> str:
+    """Return what to try with a damaged recording."""
+    listing = f"acquire verify {place}, which lists all damage"
+    if "its file cannot be read" in damage:
+        # Its lines may come back: they must not be flagged as missing.
+        return f"the disk, and the permissions of the files; {listing}"
+    if damage.startswith("its segment "):
+        return f"the segment from a copy; {listing}"
+    return f"{listing}; acquire recover {place}, which flags what is lost as missing"
+
+
 def _is_left(facts: dict[str, Any]) -> bool:
     """Whether its writer has ended without sealing it."""
     return facts["state"] != "sealed" and facts["written"] is False

@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from acquire.cli.completion import recordings
-from acquire.cli.output import JsonFlag, print_facts, print_json, print_table, quantity, say
+from acquire.cli.output import JsonFlag, print_facts, print_json, print_table, print_warning, quantity, say
 from acquire.cli.places import given_path, local_directory, local_path
 from acquire.cli.progress import stage_progress
-from acquire.cli.recording_page import COLUMNS, LISTED, list_row, recording_facts
+from acquire.cli.recording_page import COLUMNS, LISTED, list_row, recording_facts, what_to_try
 from acquire.cli.stretch import FirstLineOption, FromOption, LinesOption, ToOption, lines_between
 from acquire.cli.tiles import TileOption, tile_of
 from acquire.errors import AcquireError, DataError, UsageError
@@ -82,6 +82,7 @@ def list_recordings(
         say(f"there are no recordings in {directory}" + (f", but {others}" if others else ""))
     else:
         print_table(COLUMNS, map(list_row, found))
+        _print_damage(found)
 
 
 def info(recording: PlaceArgument, json: JsonFlag = False) -> None:
@@ -135,6 +136,8 @@ def verify(recording: PlaceArgument, json: JsonFlag = False) -> None:
         _print_list("lost, flagged as missing", map(str, found.recovered))
         _print_list("contradictions", found.contradictions)
         _print_list("note", found.notes)
+        if any("cannot be read" not in each.what for each in found.damage) and "://" not in recording:
+            say(f"  to try: acquire recover {recording}, which flags what is lost as missing")
     if not found.intact:
         # No message: the list above, or the JSON, says what is wrong.
         raise typer.Exit(DataError.exit_code)
@@ -164,7 +167,8 @@ def recover(recording: RecordingArgument, json: JsonFlag = False) -> None:
     if done.not_listed:
         say(f"  it is not listed in the first recording of its run: {done.not_listed}")
     if done.indices_mended:
-        say(f"  {done.indices_mended} file indices were repaired")
+        indices = "indices of files were" if done.indices_mended > 1 else "index of a file was"
+        say(f"  {done.indices_mended} {indices} repaired")
     _print_list("lost of a table", done.tables_lost.values())
     _print_list("lost, flagged as missing", map(str, done.damage))
 
@@ -335,6 +339,20 @@ def _print_list(title: str, items: Iterable[str]) -> None:
         say(f"  {title}: and {len(listed) - LISTED} more; --json has them all")
 
 
+def _print_damage(found: Iterable[dict[str, Any]]) -> None:
+    """Print what is wrong with the recordings of a list, and what to try."""
+    damaged = [each for each in found if each.get("damage") or each.get("hint")]
+    # Standard output is for the list.
+    for each in damaged[:LISTED]:
+        if "error" in each:
+            print_warning(f"{each['error']}; try: {each['hint']}")
+        else:
+            place, damage = each["path"], each["damage"]
+            print_warning(f"{place}: {damage}; try: {what_to_try(place, damage)}")
+    if len(damaged) > LISTED:
+        print_warning(f"{len(damaged) - LISTED} more are damaged; --json has them all")
+
+
 def _summary(path: Path) -> dict[str, Any] | None:
     """Return the facts of a recording for a list, or its error; None for a plain file and what is listed
     elsewhere.
@@ -355,7 +373,7 @@ def _summary(path: Path) -> dict[str, Any] | None:
         opened = open_outline(path)
         facts = opened.info() | {"damage": _damage(opened)}
     except AcquireError as error:
-        return {"path": str(path), "error": error.message}
+        return {"path": str(path), "error": error.message, "hint": error.hint}
     except (*DAMAGE, MemoryError) as error:  # one damaged recording must not keep the others off the list
         return {"path": str(path), "error": f"{path} cannot be read: {cause_in_words(error)}"}
     keys = ("path", "run_id", "state", "written", "run_condition", "lines")

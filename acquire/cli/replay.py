@@ -13,6 +13,7 @@ import typer
 from acquire.cli.output import JsonFlag, print_facts, print_json
 from acquire.cli.places import SOCKET, private_directory
 from acquire.cli.progress import stage_progress
+from acquire.cli.recording_page import what_to_try
 from acquire.cli.recordings import PlaceArgument
 from acquire.errors import AcquireError, DataError, UsageError
 from acquire.text import counted
@@ -204,7 +205,7 @@ def _damage(stored: Recording) -> Damage | None:
 def _damaged(place: object, found: Damage) -> DataError:
     return DataError(
         f"{place} cannot be replayed: {found}",
-        hint="acquire recover, which flags lost lines as missing: they are then replayed as missing",
+        hint=f"{what_to_try(place, str(found))}: lines that are missing are replayed as missing",
     )
 
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from dataclasses import asdict, dataclass
 from functools import cache
+from itertools import groupby
 from typing import TYPE_CHECKING, Any
 
 from acquire.errors import AcquireError
@@ -16,7 +17,7 @@ from acquire.store.array_files import COLUMNS
 from acquire.store.shape import ABSENT
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Iterator
+    from collections.abc import Callable, Iterator
 
     from acquire.store.array_files import ArrayFiles
     from acquire.store.outline import Outline
@@ -56,10 +57,10 @@ def shortfalls(recording: Outline, shards: range | None = None) -> Iterator[Dama
         for name in COLUMNS:
             array = files.files(name)
             for rows in _by_shard(recording, array.shape.shard_rows, shards):
-                for absent in _outside(lost, _absent(array, rows)):
-                    for found in _unflagged(whole, arm, absent):
-                        first = recording.first_line + found.start
-                        yield Damage(arm, name, first, len(found), "the file is gone or cut short")
+                for why, absent in _absent(array, rows):
+                    for left in _outside(lost, absent):
+                        for found in _unflagged(whole, arm, left):
+                            yield Damage(arm, name, recording.first_line + found.start, len(found), why)
 
 
 def first_shortfall(recording: Outline, shards: range | None = None) -> Damage | None:
@@ -102,39 +103,43 @@ def _by_shard(recording: Outline, size: int, shards: range | None) -> Iterator[r
                 yield range(max(kept.start, shard * size), min(kept.stop, (shard + 1) * size))
 
 
-def _absent(array: ArrayFiles, rows: range) -> Iterator[range]:
-    """Yield those of the rows, all of one shard, that are in chunks beyond the end of the file."""
+def _absent(array: ArrayFiles, rows: range) -> Iterator[tuple[str, range]]:
+    """Yield those of the rows, all of one shard, that cannot be in its file, with the reason."""
     shard, size = rows.start // array.shape.shard_rows, array.shape.chunk_rows
     try:
         entries, intact = array.index(shard)
         there = array.file_bytes(shard)
-    except OSError:
-        yield rows
+    except OSError as error:
+        yield f"its file cannot be read: {error.strerror or error}", rows
         return
-    start = None
-    for chunk in range(rows.start // size, -(-rows.stop // size)):
+    if not intact:
+        yield "the index of its file is damaged", rows
+        return
+
+    def why(chunk: int) -> str:
         entry = entries[chunk % array.shape.shard_chunks]
-        if not intact or ABSENT in entry or sum(entry) > there:  # offset and size: where it ends
-            start = max(rows.start, chunk * size) if start is None else start
-        elif start is not None:
-            yield range(start, chunk * size)
-            start = None
-    if start is not None:
+        if ABSENT in entry:
+            return "it is not on disk"
+        return "its file is cut short" if sum(entry) > there else ""  # offset and size: where it ends
+
+    for reason, chunks in groupby(range(rows.start // size, -(-rows.stop // size)), why):
+        if reason:
+            first, *others = chunks
+            last = others[-1] if others else first
+            yield reason, range(max(rows.start, first * size), min(rows.stop, (last + 1) * size))
+
+
+def _outside(lost: list[range], rows: range) -> Iterator[range]:
+    """Yield the parts of ``rows`` that are not in ``lost``, which is in order."""
+    start = rows.start
+    for gone in lost:
+        if gone.start >= rows.stop:
+            break
+        if start < gone.start:
+            yield range(start, gone.start)
+        start = max(start, gone.stop)
+    if start < rows.stop:
         yield range(start, rows.stop)
-
-
-def _outside(lost: list[range], stretches: Iterable[range]) -> Iterator[range]:
-    """Yield the parts of ``stretches`` that are not in ``lost``, which is in order."""
-    for rows in stretches:
-        start = rows.start
-        for gone in lost:
-            if gone.start >= rows.stop:
-                break
-            if start < gone.start:
-                yield range(start, gone.start)
-            start = max(start, gone.stop)
-        if start < rows.stop:
-            yield range(start, rows.stop)
 
 
 def _unflagged(whole: Callable[[], Recording], arm: str, rows: range) -> Iterator[range]:

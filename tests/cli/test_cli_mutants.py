@@ -312,7 +312,7 @@ def test_truncated_or_missing_parts_make_a_recording_damaged(
     verified = cli("verify", alone)
     assert verified.code == 6
     assert "its segment alone-2.zarr is listed and cannot be read" in verified.out
-    assert "lines 116 to 163: the file is gone or cut short" in cli("info", short).out
+    assert "lines 116 to 163: its file is cut short" in cli("info", short).out
     refused = cli("upload", short, f"file://{tmp_path}/far.zarr")
     assert (refused.code, "is not copied: a/lines" in refused.err) == (6, True)
     assert not (tmp_path / "far.zarr").exists()

@@ -160,10 +160,13 @@ def test_a_recording_without_an_arm_is_refused_at_once_and_replayed_once_it_is_r
     for words in (("--out", tmp_path / "none.zarr"), ()):
         refused = acquire("replay", path, *words)
         assert refused.code == 6
-        assert "cannot be replayed: b/lines: lines 1001 to 2024: the file is gone" in " ".join(
+        assert "cannot be replayed: b/lines: lines 1001 to 2024: it is not on disk" in " ".join(
             refused.err.split()
         )
-        assert "acquire recover, which flags lost lines as missing" in " ".join(refused.err.split())
+        said = " ".join(refused.err.split())
+        assert (
+            f"try: acquire verify {path}, which lists all damage; acquire recover {path}, which flags" in said
+        )
     assert sorted(one.name for one in tmp_path.iterdir()) == ["hard.zarr"]
     assert recover(path).damage
     replayed(path, "--out", tmp_path / "again.zarr", "--speed", 0)
