@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import errno
 import logging
 import signal
 import socket as sockets
@@ -58,9 +59,12 @@ def serve_page(socket: Path, directory: Path, config: WebConfig) -> None:
             listener.listen(128)
         except (OSError, UnicodeError) as error:
             why = error.strerror if isinstance(error, OSError) else "no such host"
+            by_port = isinstance(error, OSError) and error.errno in (errno.EADDRINUSE, errno.EACCES)
             raise UsageError(
                 f"the page cannot listen on {config.host}:{config.port}: {why}",
-                hint="choose another web.port, or 0 for any free port",
+                hint="choose another web.port (--port), or 0 for any free port"
+                if by_port
+                else "choose an address of this host as web.host (--host): 127.0.0.1, or 0.0.0.0 for all",
             ) from error
         log.info("the operator's page: %s (the token: acquire web --link)", address_of(config, listener))
         asyncio.run(_serve(socket, directory, tokens, config, listener, context))

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import os
+import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -13,6 +15,7 @@ import psutil
 import pytest
 import xarray
 import zarr
+from waiting import until
 
 LINES = 4000
 SEED = 4711
@@ -119,6 +122,24 @@ def test_all_files_are_in_the_requested_directory(demo: tuple[Path, dict[str, An
     assert "<html" in Path(summary["report"]).read_text(encoding="utf-8")
     running = [p for p in psutil.process_iter(["cmdline"]) if str(out) in " ".join(p.info["cmdline"] or [])]
     assert not running
+
+
+@pytest.mark.parametrize("at", ["daemon.log", ".recordings-demo.lock", "recording.zarr"])
+def test_ctrl_c_leaves_a_directory_only_if_something_was_recorded(tmp_path: Path, at: str) -> None:
+    """As in a terminal, whose Ctrl-C also reaches the daemon."""
+    out = tmp_path / "run"
+    demo = subprocess.Popen(
+        [sys.executable, "-m", "acquire", "demo", f"--out={out}"],
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+    )
+    until((out / at).exists)
+    os.killpg(demo.pid, signal.SIGINT)
+    said = demo.communicate(timeout=60)[1]
+    assert demo.returncode == 130, said
+    assert "Traceback" not in said
+    assert (out / "recording.zarr").exists() == out.exists() == (at == "recording.zarr")
 
 
 def test_a_directory_that_exists_is_refused_and_untouched(demo: tuple[Path, dict[str, Any]]) -> None:

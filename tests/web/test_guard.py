@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import json
+import socket
 import stat
 import subprocess
 import sys
@@ -18,7 +19,7 @@ from starlette.applications import Starlette
 from starlette.responses import PlainTextResponse
 from starlette.routing import Route
 
-from acquire.config import load_rig
+from acquire.config import builtin_directory, load_rig
 from acquire.config.web import WebConfig
 from acquire.daemon.control import new_app
 from acquire.errors import ConfigError, PlaceError, UsageError
@@ -246,6 +247,31 @@ def test_tokens_that_others_can_read_are_refused(tmp_path: Path) -> None:
 def test_the_page_is_closed_to_other_hosts_by_default(settings: dict[str, Any], words: str) -> None:
     with pytest.raises(ConfigError, match=words):
         load_rig("rig-demo", {f"web.{key}": value for key, value in settings.items()})
+
+
+def test_an_address_that_is_not_this_host_s_is_refused_as_such(tmp_path: Path) -> None:
+    """Another port was advised, which helps only if that is the trouble."""
+    rig = tmp_path / "rig.toml"
+    rig.write_text((builtin_directory() / "rig-demo.toml").read_text() + "\n[web]\nplain = true\n")
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+        for host, advice in (
+            ("no.such.host.invalid", "choose an address of this host as web.host (--host)"),
+            ("192.0.2.1", "choose an address of this host as web.host (--host)"),
+            ("127.0.0.1", "choose another web.port (--port)"),
+        ):
+            words = ["web", f"--config={rig}", f"--host={host}", f"--port={port}", f"--socket={tmp_path}/s"]
+            done = subprocess.run(
+                [sys.executable, "-m", "acquire", *words],
+                capture_output=True,
+                text=True,
+                timeout=60,
+                check=False,
+            )
+            assert done.returncode == 2, done.stderr
+            assert f"the page cannot listen on {host}:{port}: " in done.stderr
+            assert f"try: {advice}" in done.stderr
+            assert "Traceback" not in done.stderr
 
 
 def test_names_and_addresses(tmp_path: Path) -> None:

@@ -98,16 +98,18 @@ def demo(
     check(plan, rig)
 
     from acquire.cli.demo.analysis import analyse
-    from acquire.cli.demo.capture import compile_gateware, record
+    from acquire.cli.demo.capture import compile_gateware, record, removed_if_interrupted
     from acquire.evaluate.report import write_report
     from acquire.evaluate.summary import summarise
 
     # Fails if it was made since the check: nobody else's directory is filled.
     make_directory(plan.out)
     journal = StepJournal()
-    if rig.trigger.driver == "rtl":
-        compile_gateware(rig, journal)
-    result = analyse(plan, record(plan, journal), rig, journal)
+    with removed_if_interrupted(plan.out):
+        if rig.trigger.driver == "rtl":
+            compile_gateware(rig, journal)
+        captured = record(plan, journal)
+    result = analyse(plan, captured, rig, journal)
     with journal.stage("Write the report"):
         page = write_report(result, plan.out)
     if json:

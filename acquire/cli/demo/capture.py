@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 import subprocess
 import sys
 import time
@@ -73,6 +74,21 @@ def record(plan: DemoPlan, journal: StepJournal) -> Captured:
                 if not end(process):
                     raise AcquireError(f"the daemon was killed after {END_TIMEOUT_S:g} s", hint=str(log))
     return captured
+
+
+@contextmanager
+def removed_if_interrupted(directory: Path) -> Iterator[None]:
+    """If Ctrl-C comes before a recording was begun, remove the directory, with the daemon's log and lock.
+
+    After an error the directory stays, since the error refers to the log.
+    """
+    try:
+        yield
+    except KeyboardInterrupt:
+        names = {each.name for each in directory.iterdir()}
+        if all(name == LOG or name.endswith(".lock") for name in names):
+            shutil.rmtree(directory)
+        raise
 
 
 def compile_gateware(rig: RigConfig, journal: StepJournal) -> None:
