@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -184,9 +185,14 @@ def _light(measured: Measured) -> str:
 
 def _both(measured: Measured, unit: str) -> str:
     return ", ".join(
-        f"{arm} {value:.5g}{unit} ± {error:.2g}"
+        f"{arm} {_rounded(value, error):.5g}{unit} ± {error:.2g}"
         for arm, value, error in zip("ab", measured.value, measured.uncertainty, strict=True)
     )
+
+
+def _rounded(value: float, error: float) -> float:
+    """Round a value to the second digit of its uncertainty: the others are chance."""
+    return round(value, 1 - math.floor(math.log10(error))) if 0 < error < math.inf else value
 
 
 def _alignment(found: AlignmentFound) -> dict[str, str]:

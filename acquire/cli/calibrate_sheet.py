@@ -10,6 +10,7 @@ import typer
 from acquire.cli.completion import rigs
 from acquire.cli.output import JsonFlag, print_facts, print_json
 from acquire.errors import UsageError
+from acquire.text import counted
 
 FORMATS = (".svg", ".png")
 LARGEST_PIXELS = 4096
@@ -52,7 +53,7 @@ def sheet(
 
     Example: [bold]acquire calibrate sheet --out target.svg --field-mm 60 --config rig.toml[/]
     """
-    from acquire.calibrate.sheet import svg
+    from acquire.calibrate.sheet import FINER, svg
     from acquire.config import load_rig
     from acquire.store.delivery import whole_file
     from acquire.store.refusals import refused
@@ -62,17 +63,22 @@ def sheet(
     geometry = load_rig(config).geometry
     n = geometry.stages * geometry.substeps
     if suffix == ".svg":
-        data = svg(geometry.substeps, geometry.stages, field_mm).encode("utf-8")
+        data, size = (
+            svg(geometry.substeps, geometry.stages, field_mm).encode("utf-8"),
+            f"{field_mm / n:.3g} mm",
+        )
     else:
-        data = _png(geometry.substeps, n)
+        # A picture has no millimetres: it is as wide as the screen or printer that shows it makes it.
+        finer = max(1, min(FINER, LARGEST_PIXELS // n))
+        data, size = _png(geometry.substeps, n, finer), counted(finer, "pixel")
     with whole_file(out) as part, refused(out, "written"):
         part.write_bytes(data)
-    facts = {"sheet": str(out), "fine pixels": n, "a fine pixel": f"{field_mm / n:.3g} mm"}
+    facts = {"sheet": str(out), "fine pixels": n, "a fine pixel": size}
     (print_json if json else print_facts)(facts)
 
 
-def _png(substeps: int, size: int) -> bytes:
-    """Return a picture of the field, with a whole number of pixels per fine pixel."""
+def _png(substeps: int, size: int, finer: int) -> bytes:
+    """Return a picture of the field, with ``finer`` pixels per fine pixel."""
     import io
 
     import numpy as np
@@ -80,7 +86,6 @@ def _png(substeps: int, size: int) -> bytes:
 
     from acquire.calibrate.sheet import FINER, Sheet
 
-    finer = max(1, min(FINER, LARGEST_PIXELS // size))
     light = Sheet(substeps).picture(size * finer, finer=max(1, FINER // finer), scale=finer)
     file = io.BytesIO()
     Image.fromarray(np.rint(255 * light).astype(np.uint8)).save(file, "PNG", optimize=True)

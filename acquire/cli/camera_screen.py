@@ -100,7 +100,7 @@ def sparkline(values: list[float]) -> str:
 def advice(reading: Reading | None) -> str:
     """Return the problem with a reading and what to do about it; empty if there is none."""
     if reading is None:
-        return "the camera does not respond"
+        return "no reading yet: the camera is starting, or does not respond"
     if reading.level is None:
         return "no lines are arriving: is the trigger running, and its cable connected to the camera's input?"
     # In the order of urgency: the first that applies is shown.

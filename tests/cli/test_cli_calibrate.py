@@ -11,7 +11,8 @@ import pytest
 from instruments import COLUMNS, NOISE, dots, record, white
 from PIL import Image
 
-from acquire.calibrate import open_calibration
+from acquire.calibrate import Measured, open_calibration
+from acquire.calibrate.calibration import Finding, Instrument
 from acquire.calibrate.words import found_facts
 from acquire.store import open_video
 
@@ -55,6 +56,18 @@ def test_step_by_step_to_a_page(cli: Cli, taken: dict[str, Path], tmp_path: Path
     answer = cli("calibrate", "check", cal, taken["target"])
     assert answer.code == 0, answer.err
     assert answer.out.count("holds") == 6
+
+
+def test_figures_have_the_digits_that_they_are_sure_to() -> None:
+    """A linearity error was 0.00013199 % ± 0.0015."""
+    instrument = Instrument(stages=4, substeps=3, substep_s=1e-5, layout="dual", cameras={"a": {}, "b": {}})
+    found = {
+        "linearity_error": Measured(np.array([1.3199e-6, 0.00513]), np.array([1.5e-5, 0.0])),
+        "full_well_e": Measured(np.array([19122.4, 64.123456]), np.array([961.0, 0.0123])),
+    }
+    words = found_facts(Finding("transfer", instrument, found))
+    assert words["linearity error"] == "a 0.0001 % ± 0.0015, b 0.513 % ± 0"
+    assert words["full well"] == "a 19120 e ± 9.6e+02, b 64.123 e ± 0.012"
 
 
 def test_a_full_well_that_a_repeated_transfer_keeps_is_said(cli: Cli, tmp_path: Path) -> None:
@@ -275,7 +288,8 @@ def test_the_sheet_is_drawn(cli: Cli, tmp_path: Path) -> None:
     assert "0.3 mm" in answer.out
     assert "The cameras see 57.6 mm × 57.6 mm of it" in paper.read_text(encoding="utf-8")
     answer = cli("calibrate", "sheet", "--out", screen, "--json")
-    assert answer.json["fine pixels"] == 192
+    # A picture has no millimetres: those of the default field were another size than the print's.
+    assert (answer.json["fine pixels"], answer.json["a fine pixel"]) == (192, "8 pixels")
     with Image.open(screen) as picture:
         assert picture.size == (1536, 1536)
     again = cli("calibrate", "sheet", "--out", screen)

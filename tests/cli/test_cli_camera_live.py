@@ -79,6 +79,8 @@ def test_the_screen_names_the_problem() -> None:
     assert "\x1b" not in shown
     assert "saturated: use less light" in shown
     assert "no lines are arriving" in shown
+    # The first lines may take seconds, and a camera that is starting was said not to respond.
+    assert reading_text(None).startswith("no reading yet: ")
     assert bar(0.5).count("█") == 16
     line = sparkline([1.0, 2.0, 3.0])
     assert (line[0], line[-1]) == ("▁", "█")
