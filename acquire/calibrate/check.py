@@ -12,7 +12,7 @@ from acquire.calibrate.calibration import Finding, Measured
 from acquire.calibrate.columns import dark, flat
 from acquire.calibrate.field import field_edge
 from acquire.calibrate.psf import psf
-from acquire.calibrate.target import alignment, orientation
+from acquire.calibrate.target import LESS_CERTAIN, alignment, orientation
 from acquire.errors import UsageError
 from acquire.lines import ARMS
 
@@ -118,6 +118,8 @@ def check(exposure: Exposure, known: Calibration, *, covered: bool = False) -> C
         doubt = f"the orientation {result}; the calibration has {expected!r}"
         return Check(blur, (*doubts, doubt), same_view=found.orientation is None)
     aligned = alignment(exposure, known)
+    # Of such a target, what seems to have changed need not have.
+    doubts += tuple(each for each in aligned.warnings if LESS_CERTAIN in each)
     return Check((*_alignment(aligned, known), *_light_of_target(aligned, known), *blur), doubts)
 
 

@@ -51,6 +51,8 @@ ENOUGH_FINE = 0.08
 """Share of fine detail with which it is certain all the same. The sheet has large squares among its dots, and
 a share of 0.08 to 0.14, with a blur of up to 1.3 fine pixels; dots that a blur of 4 leaves coarse have 0.04
 to 0.07."""
+LESS_CERTAIN = "the alignment is less certain than it says"
+"""What warnings of an unfit target say."""
 SAME_BALANCE = 0.002
 """Difference of the arms' light up to which the flat's balance is kept."""
 BALANCE_ERROR = 0.001
@@ -216,13 +218,13 @@ def _unfit(known: Calibration, *stills: Still) -> list[str]:
     if "offset_dn" in known.quantities and unrest > UNREST:
         warnings.append(
             f"the target moved while it was recorded, or its light flickered (successive lines are alike to "
-            f"{unrest:.0%} in what a scene at rest does not explain): the alignment is less certain than it "
-            "says; repeat it with the target at rest"
+            f"{unrest:.0%} in what a scene at rest does not explain): {LESS_CERTAIN}; repeat it with the "
+            "target at rest"
         )
     if detail >= COARSE and min(each.fine for each in stills) < ENOUGH_FINE:
         warnings.append(
-            f"the target's detail is about {detail} fine pixels wide: coarse, or out of focus; the alignment "
-            "is less certain than it says; focus both cameras, or use a target with detail of 2 to 6"
+            f"the target's detail is about {detail} fine pixels wide: coarse, or out of focus; "
+            f"{LESS_CERTAIN}; focus both cameras, or use a target with detail of 2 to 6"
         )
     return warnings
 

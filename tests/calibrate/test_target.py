@@ -14,6 +14,7 @@ from scipy.ndimage import gaussian_filter, shift
 
 from acquire.alignment import Alignment
 from acquire.calibrate import Calibration, Measured, calibrated
+from acquire.calibrate.check import check
 from acquire.calibrate.columns import dark, flat
 from acquire.calibrate.exposure import instrument_of, open_exposure
 from acquire.calibrate.orientation import MODEL, VIEWS, View, oriented
@@ -300,8 +301,15 @@ def test_a_target_that_moved_is_reported(tmp_path: Path, recordings: dict[str, P
     path = record(tmp_path / "dark.zarr", white(effects=NOISE), "dark")
     first = dark(open_exposure(path))
     known = Calibration(first.instrument).with_step(first)
-    found = alignment(open_exposure(moving(tmp_path, 1.0)), known)
+    exposure = open_exposure(moving(tmp_path, 1.0))
+    found = alignment(exposure, known)
     assert "the target moved while it was recorded" in found.warnings[0]
+    # A check with it called the instrument changed, without this doubt.
+    still = open_exposure(recordings["target"])
+    calibrated_once = known.with_step(orientation(still, known)).with_step(alignment(still, known))
+    doubts = check(exposure, calibrated_once).doubts
+    assert any("the target moved while it was recorded" in each for each in doubts), doubts
+    assert not any("moved" in each for each in check(still, calibrated_once).doubts)
 
 
 def test_a_target_out_of_focus_is_reported(tmp_path: Path, known: Calibration) -> None:
