@@ -5,7 +5,6 @@ from __future__ import annotations
 import errno
 import json
 import os
-import shutil
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -14,66 +13,14 @@ from typing import Any
 import numpy as np
 import pytest
 import zarr
+from small_recordings import FIRST, M, S, block, spec, write
 
 from acquire.cli.recording_page import CELL_CHARACTERS
-from acquire.clock import ClockFit
-from acquire.codes import PrbsCode
-from acquire.lines import ARMS, LineFlag, LineTable, TaggedBlock
-from acquire.store import RecordingSpec, RecordingWriter, Retention, RunCondition, open_recording, write_video
+from acquire.lines import ARMS
+from acquire.store import RecordingWriter, Retention, RunCondition, open_recording, write_video
 from acquire.store.suspect import DOUBTFUL, VERIFIED
 
 Cli = Callable[..., Any]
-M, S, FIRST, LINES = 4, 2, 100, 64
-CODE = PrbsCode(15, 77)
-
-
-def spec() -> RecordingSpec:
-    camera = {"white_dn": 4095, "black_level_dn": 1.0, "responsivity_dn": 2.0}
-    return RecordingSpec(
-        run_id="run-1",
-        stages=M,
-        substeps=S,
-        pixels=M,
-        dtype="uint16",
-        first_line=FIRST,
-        clock=ClockFit(90_000_000, 1_700_000_000_000_000_000, 100),
-        code=CODE.to_attrs(),
-        substep_ticks=900,
-        trigger={"model": "test"},
-        cameras={"a": camera, "b": camera},
-        config={},
-        chunk_lines=16,
-    )
-
-
-def block(arm: str, lost: range) -> TaggedBlock:
-    line = np.arange(FIRST, FIRST + LINES, dtype=np.uint64)
-    bits = CODE.bits(S * FIRST, S * LINES).reshape(LINES, S)
-    flags = np.where(np.isin(line, lost), LineFlag.MISSING, 0).astype(np.uint16)
-    return TaggedBlock(
-        arm=arm,
-        first_line=FIRST,
-        pixels=np.full((LINES, M), 7 if arm == "a" else 9, np.uint16),
-        flags=flags,
-        tags=LineTable(
-            code_index=S * line,
-            code=np.packbits(bits, axis=1, bitorder="little")[:, 0],
-            tick=900 * S * line,
-            time_ns=(20_000 * line).astype(np.int64),
-        ),
-    )
-
-
-def write(path: Path, lost: range = range(0)) -> Path:
-    with RecordingWriter.create(path, spec()) as writer:
-        for arm in ARMS:
-            gone = lost if arm == "b" else range(0)
-            if gone:
-                writer.add_gap(arm, gone.start, len(gone), "ring_full")
-            writer.append(block(arm, gone))
-        condition = RunCondition.INCOMPLETE if lost else RunCondition.GOOD
-        writer.seal(condition, "stopped", {})
-    return path
 
 
 @pytest.fixture
@@ -299,62 +246,6 @@ def test_cut_outside_names_the_available_lines(cli: Cli, recording: Path, tmp_pa
     assert answer.code == 2
     assert "possible: lines 100 to 163" in answer.err
     assert not (tmp_path / "c.npz").exists()
-
-
-def test_verify_names_lost_lines_and_exits_with_6(cli: Cli, recording: Path) -> None:
-    answer = cli("verify", recording)
-    assert (answer.code, answer.out.split("; ")[0]) == (0, f"{recording}: intact")
-    (recording / "b" / "tick" / "c" / "0").unlink()
-    answer = cli("verify", recording)
-    assert answer.code == 6
-    assert "not intact on disk: b/tick: lines 100 to 163: it is not on disk" in answer.out
-    found = cli("verify", recording, "--json")
-    assert (found.code, found.json["damage"][0]["count"]) == (6, 64)
-
-
-def test_damage_is_named_with_what_to_try(cli: Cli, tmp_path: Path) -> None:
-    """`ls` said no more than DAMAGED, and a file that could not be read was "gone or cut short"."""
-    whole, gone, short, unread, rootless = (
-        write(tmp_path / f"{name}.zarr") for name in ("whole", "gone", "short", "unread", "rootless")
-    )
-    shutil.rmtree(gone / "b")
-    with (short / "b" / "lines" / "c" / "0" / "0").open("r+b") as file:
-        file.truncate(5000)
-    (unread / "b" / "lines" / "c" / "0" / "0").unlink()
-    (unread / "b" / "lines" / "c" / "0" / "0").mkdir()
-    (rootless / "zarr.json").unlink()
-    answer = cli("ls", tmp_path)
-    assert len(answer.out.splitlines()) == 6
-    said = " ".join(answer.err.split())
-    repair = "try: acquire verify {0}, which lists all damage; acquire recover {0}, which flags what is lost"
-    assert f"{gone}: b/lines: lines 100 to 163: it is not on disk; {repair.format(gone)}" in said
-    assert f"its file is cut short; {repair.format(short)}" in said
-    assert f"{unread}: b/lines: lines 100 to 163: its file cannot be read: " in said
-    assert f"try: the disk, and the permissions of the files; acquire verify {unread}, which" in said
-    assert f"try: acquire recover {rootless}" in said
-    assert str(whole) not in said
-    # Lines that may come back are not to be flagged as missing.
-    for path, advised in ((gone, True), (short, True), (unread, False)):
-        assert (f"acquire recover {path}" in cli("verify", path).out) == advised
-        refused = cli("replay", path, "--out", tmp_path / "again.zarr")
-        assert refused.code == 6
-        assert (f"acquire recover {path}" in refused.err) == advised, refused.err
-    assert cli("recover", short).code == 0
-    assert str(short) not in cli("ls", tmp_path).err
-
-
-def test_recover_seals_an_unfinished_recording(cli: Cli, tmp_path: Path) -> None:
-    path = tmp_path / "left.zarr"
-    with RecordingWriter.create(path, spec()) as writer:
-        for arm in ARMS:
-            writer.append(block(arm, range(0)))
-    answer = cli("recover", path)
-    assert (answer.code, answer.err) == (0, "")
-    assert "64 lines, recovered and sealed; 64 lines were on disk that no commit listed" in answer.out
-    assert cli("recover", path).out == f"{path}: 64 lines, nothing to recover\n"
-    assert cli("recover", path, "--json").json["changed"] is False
-    assert "INTERRUPTED" in cli("info", path).out
-    assert cli("verify", path).code == 0
 
 
 def test_info_states_what_can_be_lost(cli: Cli, recording: Path) -> None:
