@@ -99,6 +99,8 @@ def _on_bends(volume: Trial, candidate: Candidate, rival: float) -> tuple[Trial,
     finer = drifting(found)
     if finer is not None and len(finer.drift) > len(found.candidate.drift):
         found = better(found, finer)
+        if found.error > OUTDONE * at_rest.error:  # else more iterations at rest would decide nothing
+            at_rest = better(at_rest, at_rest.candidate)
     return found, min(at_rest, volume, key=_error)
 
 
