@@ -97,8 +97,11 @@ def first_look(given: Given, still: Array | None = None) -> InBand:
 def glance(given: Given, still: Array | None = None) -> InBand:
     """The first iterations of a first look, after which it can be compared with other priors."""
     lamps = _look_for_lamps(given, still)
-    if lamps is not None:
-        return lamps
+    return glance_at_band(given, still) if lamps is None else lamps
+
+
+def glance_at_band(given: Given, still: Array | None = None) -> InBand:
+    """A glance at all cosines of the requested or estimated band, whether there are lamps or not."""
     given.clock.reset()  # the limit holds for each stage
     return _solve_glance(given, find_band(given), still)
 

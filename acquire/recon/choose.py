@@ -31,6 +31,7 @@ from acquire.recon.blinking import (
     LONGER_LOOK,
     complete_look,
     glance,
+    glance_at_band,
     refine,
     solve_in_cosines,
 )
@@ -63,6 +64,7 @@ from acquire.recon.workbench import (
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
+    from acquire.arrays import Array
     from acquire.lines import Segment
     from acquire.recon.clock import IterationClock
     from acquire.recon.estimates import Estimate, InBand
@@ -103,6 +105,8 @@ REPEATS = 0.8
 """Largest error of a cycle, relative to the volume's, the still's and the cosines' at a glance, for which it
 is a candidate: a video that repeats itself claims more than any other. Motion that repeats has 0.4 to 0.7,
 text that scrolls 0.9."""
+NEARLY = 8
+"""Largest number of trials of a cycle that predicts better than all others, but not far better."""
 CLOSE, NOT_FAR = 1.1, 2.0
 """Largest error of the cosines, relative to the best trial's, for which they are continued, and for which
 they are if clear patterns were found, or if only a glance was taken."""
@@ -140,24 +144,28 @@ class AdmmSolver(Solver):
         if clock.spent(SEARCH_SHARE):
             clock.shortcuts.append(f"{clock.cause} left no time to try more than one kind of motion")
             return bench.finish(volume)
-        return _choose(bench, volume, trials)
+        tried = _Tried(volume, bench.attempt(bench.fitting(STILL), FIRST_ITERATIONS))
+        return _choose(bench, tried, glance(given, _start(bench, tried)), trials)
 
 
-def _choose(bench: Workbench, volume: Trial, trials: int) -> Estimate:
-    """Compare a first volume with a still, the cosines and the other priors, and solve with the best.
+def _start(bench: Workbench, tried: _Tried) -> Array | None:
+    """Coefficients from which the cosines start; None if they start from zero."""
+    volume, plain = tried.volume, tried.plain
+    at_rest = plain.error < AT_REST and not bench.held_out.clearly_less(volume.errors, plain.errors)
+    return plain.coefficients if at_rest else None
+
+
+def _choose(bench: Workbench, tried: _Tried, cosines: InBand, trials: int) -> Estimate:
+    """Compare a first volume with a still, a glance at the cosines and the other priors; solve with the best.
 
     Scenes that blink need most of a budget for the cosines, and others need it for the search: a glance
     decides which comes first. Many cosines take ten times as long as a trial of the others.
     """
     given, clock = bench.given, bench.clock
-    plain = bench.attempt(bench.fitting(STILL), FIRST_ITERATIONS)
-    at_rest = plain.error < AT_REST and not bench.held_out.clearly_less(volume.errors, plain.errors)
-    cosines = glance(given, plain.coefficients if at_rest else None)
     # The time is taken now, because the trials below forget how long the cosines' iterations are.
     rest_s = (LONGER_LOOK - GLANCE) * clock.longest_s
     errors = bench.record_errors({"prior": "cosines"} | cosines.facts(), cosines.predict())
     at_a_glance, clear = bench.held_out.relative(errors), has_clear_patterns(cosines)
-    tried = _Tried(volume, plain)
     lamps = isinstance(cosines.basis, LearnedBasis) and tried.best.error > HOPELESS * at_a_glance
     # Evident lamps need the time for themselves.
     followed = None if clear or lamps else _try_motion(bench, tried, cosines, at_a_glance)
@@ -171,6 +179,8 @@ def _choose(bench: Workbench, volume: Trial, trials: int) -> Estimate:
             refined = refine(given, cosines)
             if (clear or isinstance(refined, Refined)) and _wins(bench, refined, tried.best):
                 return Preferred(refined, bench.record)
+        if lamps and not isinstance(refined, Refined) and (whole := _no_lamps(bench, tried, cosines)):
+            return _choose(bench, _Tried(tried.volume, tried.plain), whole, trials)
     best = _search(bench, tried, trials, bench.error(cosines.predict()) if ahead else np.inf)
     near = at_a_glance < NOT_FAR * best.error and clock.affords(rest_s, FIRST_LOOK_SHARE)
     if not ahead and near:
@@ -180,6 +190,18 @@ def _choose(bench: Workbench, volume: Trial, trials: int) -> Estimate:
     if refined is not None and _wins(bench, refined, best):
         return Preferred(refined, bench.record)
     return bench.finish(best)
+
+
+def _no_lamps(bench: Workbench, tried: _Tried, cosines: InBand) -> InBand | None:
+    """A glance at the whole band, if it predicts better than the cosines of lamps; None if it does not.
+
+    A crank that turns fast looks like lamps at first: it has a few rhythms, too. But it has all harmonics of
+    them, its places are no patterns, and no period shows in the cosines that lamps would have.
+    """
+    if bench.clock.spent(SEARCH_SHARE):
+        return None
+    whole = glance_at_band(bench.given, _start(bench, tried))
+    return whole if bench.error(whole.predict()) < FREER * bench.error(cosines.predict()) else None
 
 
 def _try_motion(bench: Workbench, tried: _Tried, cosines: InBand, at_a_glance: float) -> Trial | None:
@@ -251,6 +273,8 @@ def _cycle(bench: Workbench, cosines: InBand, rival: float, *, lamps: bool) -> T
         # Sharp edges that move take more harmonics than a first trial has. Lamps are better off in patterns.
         finer = None if lamps else cycle.candidate.with_coefficients(1, bench.frames)
         cycle = cycle if finer is None else better(cycle, finer)
+        if not lamps and REPEATS * rival <= cycle.error < rival:
+            cycle = bench.climb(cycle, NEARLY)
     return cycle if cycle.error < REPEATS * rival else None
 
 

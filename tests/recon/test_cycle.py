@@ -287,9 +287,17 @@ def test_short_periods_have_fewer_harmonics() -> None:
     assert most.is_stronger_than(CYCLE)
 
 
-def test_a_cycle_that_nearly_wins_gets_more_harmonics_before_it_is_dropped() -> None:
-    """With eight it has 0.81 of the cosines' error, which then have 22.8 dB."""
-    piston = record("piston", 3101, camera=CameraNoise(1e4))
+@pytest.mark.parametrize(
+    ("seed", "least_db"),
+    [
+        (3101, 30),  # the cycle has 0.81 of the cosines' error with eight harmonics, and less with more
+        (5602, 26),  # 0.86 with twelve: another weight takes it below 0.8
+        (5501, 26),  # it is taken for lamps, in whose cosines no period shows
+    ],
+)
+def test_a_crank_that_turns_fast_is_a_cycle(seed: int, least_db: float) -> None:
+    """As cosines or patterns, these have 19 to 23 dB."""
+    piston = record("piston", seed, camera=CameraNoise(1e4))
     found = reconstruct(piston.segment, 3, 1, "fast", error=False)
     assert found.parameters["prior"] == "cycle"
-    assert psnr(found.video[found.trusted], piston.truth(3, 1)) > 30
+    assert psnr(found.video[found.trusted], piston.truth(3, 1)) > least_db
