@@ -14,7 +14,7 @@ import typer
 from acquire.cli.coercion import use_quick_coercion
 from acquire.cli.commands import BY_NAME, MODULES
 from acquire.cli.help import EXAMPLE, SUMMARY, make_plain, overview
-from acquire.cli.output import say
+from acquire.cli.output import print_warning, say
 from acquire.cli.words import VARIABLE
 from acquire.errors import EXIT_INTERRUPTED, UsageError
 from acquire.text import did_you_mean, own_words
@@ -113,12 +113,12 @@ def command_of(modules: Iterable[str]) -> Any:
     command = typer.main.get_command(build(modules))
     make_plain(command)
     use_quick_coercion(command)
-    _refuse_second_values(command)
+    _tell_second_values(command)
     return command
 
 
-def _refuse_second_values(command: Any) -> None:
-    """Refuse two different values of one option, of which click would silently take the last.
+def _tell_second_values(command: Any) -> None:
+    """Warn of two different values of one option, of which the last counts, as in an alias that has defaults.
 
     Repeatable options are left alone, and so are the same value given twice, environment variables and
     defaults.
@@ -132,25 +132,20 @@ def _refuse_second_values(command: Any) -> None:
             # The option objects of an unknown version of click are left alone.
             names = {**getattr(parser, "_short_opt", {}), **getattr(parser, "_long_opt", {})}
             for option in {id(each): each for each in names.values()}.values():
-                option.process = functools.partial(_process_once, option, option.process, context)
+                option.process = functools.partial(_process, option, option.process, context)
         return parser
 
     command.make_parser = make
     for below in getattr(command, "commands", {}).values():
-        _refuse_second_values(below)
+        _tell_second_values(below)
 
 
-def _process_once(option: Any, process: Any, context: Any, value: Any, state: Any) -> None:
+def _process(option: Any, process: Any, context: Any, value: Any, state: Any) -> None:
     if option.action == "store" and (before := state.opts.get(option.dest, value)) != value:
         *others, name = sorted(option.obj.opts, key=len)
         also = f" ({' or '.join(others)})" if others else ""
-        command = context.command_path
-        raise UsageError(
-            f"{command.removeprefix('acquire').lstrip()}: {name}{also} is given twice, as {before} and as "
-            f"{value}",
-            possible="one value",
-            hint=f"leave one of them out; or {command} --help",
-        )
+        words = context.command_path.removeprefix("acquire").lstrip()
+        print_warning(f"{words}: {name}{also} is given twice: {value} counts, not {before}")
     process(value, state)
 
 

@@ -35,6 +35,8 @@ NEIGHBOURS = (0.5, 1.0, 1.0)
 does not show its own."""
 LEAST_ENERGY = 1e-14
 """Least energy, relative to the largest."""
+LARGEST_PENALTY = 1e20
+"""That of coefficients without energy: whatever the weight, it makes them 0, and float32 holds it."""
 
 
 def learn_spectrum(smooth: Trial) -> Trial:
@@ -66,4 +68,5 @@ def spectrum_of(trial: Trial) -> Wiener:
     # as the light as a whole does, has an energy of its own.
     energies = (own + np.exp(gaussian_filter(np.log(own + least), NEIGHBOURS))) / 2
     penalty = np.square(residual, dtype=np.float64).mean() / np.maximum(energies, least)
+    penalty = np.minimum(penalty, LARGEST_PENALTY)
     return Wiener(lambda *_: penalty)

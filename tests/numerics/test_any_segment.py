@@ -121,3 +121,9 @@ def test_curves_of_which_nothing_is_left_are_solved() -> None:
     """One bright sample among lines below the black level: the video becomes dark, and its curves 0."""
     segment = damage(record(Geometry(1, 1, 19), 19, 300.0), "one sample", 19)
     assert np.isfinite(reconstruct(segment, 1, 1, "best", refuse=False).video).all()
+
+
+def test_a_spectrum_of_which_nothing_is_left_is_solved() -> None:
+    """One bright sample of one line below the black level: the penalty of its energies overflowed."""
+    segment = damage(record(Geometry(7, 1, 1), 1, 0.0), "one sample", 1)
+    assert np.isfinite(reconstruct(segment, 6, 1, "fast", refuse=False).video).all()
