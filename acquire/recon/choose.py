@@ -85,7 +85,8 @@ FAR = 1.25
 FINEST_COSINES, QUICK = 54, 0.87
 """Number of cosines in which a smooth volume is tried again, and its largest error, relative to that in the
 first number, for which nothing flows: something moves too fast for these. Flames and waves, which are
-complete in 24, have 0.91 to 1.08, and balls that hop across the field 0.55 to 0.82."""
+complete in 24, have 0.91 to 1.08, and balls that hop across the field 0.55 to 0.82, but in short ranges up to
+0.97: some of these are missed."""
 NEED_NO_MORE = 0.2
 """Error of a smooth volume, relative to a still's, below which a budget is not spent on trying it again,
 unless the cosines at a glance predict better. Such balls have 0.23 to 0.5, and on 96 stages 0.16 to 0.24, of
@@ -210,8 +211,8 @@ def _try_motion(bench: Workbench, tried: _Tried, cosines: InBand, at_a_glance: f
     These are tried even where cosines are ahead: a scene that flickers gains 6.6 to 15 dB by this, a flame up
     to 7, and what moves or turns by a path or a cycle.
     """
-    # From zero, flames on 80 stages and more have 3 times the cosines' error after a few iterations, though
-    # they end below it. From the volume, which has most of their light, they have 0.7 to 1.0.
+    # From zero, most flames on 80 stages and more have 3 times the cosines' error after a few iterations,
+    # though they end below it. From the volume, which has most of their light, they have less at once.
     rival = min(at_a_glance, tried.best.error)
     tried.smooth = bench.probe(bench.fitting(SMOOTH), rival, start=tried.volume)
     enough = min(at_a_glance, NEED_NO_MORE * tried.plain.error) if bench.clock.has_budget else 0.0
